@@ -1,0 +1,62 @@
+"""What the network says about a batch of clouds: the one type that metrics, export and pictures read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Parts, poses, canonical shapes and joints of B clouds.
+
+    Camera space is the space of the input points (normalised units). Joint j is the edge from part `joint_child[:, j]`
+    to the part nearer to the root, `joint_parent[:, j]`; there are J = K - 1 joints.
+
+    Attributes:
+        part_id: [B, N] part of every input point, 0..K-1.
+        part_probability: [B, N, K] association W of every point with every part.
+        part_pose: [B, K, 4, 4] canonical part space -> camera space.
+        part_shape: [B, K, M, 3] canonical part shapes Z_i, in canonical part space.
+        assembly: [B, K, 3] translations p_i^c; `part_shape + assembly` is the canonical object shape Z.
+        base_pose: [B, 4, 4] canonical object space -> camera space: the base part's rigid transformation.
+        joint_parent: [B, J] int64.
+        joint_child: [B, J] int64.
+        joint_type: [B, J] int64, 0 revolute, 1 prismatic.
+        joint_axis: [B, J, 3] unit, camera space.
+        joint_pivot: [B, J, 3] a point on the joint line, camera space.
+        joint_state: [B, J] radians or displacement relative to the canonical object shape.
+        canonical_axis: [B, J, 3] the same axes in canonical object space.
+        canonical_pivot: [B, J, 3] the same pivots in canonical object space.
+        reconstruction_error: [B] distance between the cloud and its reconstruction (the loss's distance, L1 type).
+    """
+
+    part_id: Tensor
+    part_probability: Tensor
+    part_pose: Tensor
+    part_shape: Tensor
+    assembly: Tensor
+    base_pose: Tensor
+    joint_parent: Tensor
+    joint_child: Tensor
+    joint_type: Tensor
+    joint_axis: Tensor
+    joint_pivot: Tensor
+    joint_state: Tensor
+    canonical_axis: Tensor
+    canonical_pivot: Tensor
+    reconstruction_error: Tensor
+
+    @property
+    def num_parts(self) -> int:
+        """K."""
+        return self.part_pose.shape[1]
+
+    def __getitem__(self, index) -> Prediction:
+        """A sub-batch (slice, mask or index tensor) of every field."""
+        return Prediction(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+    def to(self, device) -> Prediction:
+        """Every field on `device`."""
+        return Prediction(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})

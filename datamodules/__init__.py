@@ -1,0 +1,1 @@
+"""Lightning DataModules, the npz shard format and the geometry that data and method share."""

@@ -1,0 +1,1 @@
+"""Articulated objects, their posing and rendering, and the generator behind `make data`."""
