@@ -1,0 +1,160 @@
+"""The manifest: what a generated data set is, how it was made, and the checksums of its shards."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from datamodules.atomic import atomic_write
+
+SCHEMA_VERSION = 1
+MANIFEST_NAME = "manifest.json"
+SPLITS = ("train", "test")
+VIEWS = ("complete", "partial")
+PROTOCOLS = ("honest", "eap")
+
+
+class ManifestError(ValueError):
+    """A manifest is missing, damaged or of another schema version; the message names the file and the remedy."""
+
+
+@dataclass(frozen=True)
+class ShardEntry:
+    """One shard of a split: file name inside the split's folder, number of samples, and checksum."""
+
+    name: str
+    samples: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Description of one generated data set.
+
+    Attributes:
+        generator_version: Version of the package that made the set.
+        options: Every option of the generator.
+        seed: Seed of the generator.
+        category: Category name.
+        source: Where the articulated objects come from, for example `procedural`.
+        view: `complete` or `partial`.
+        protocol: `honest` or `eap` for partial views, None for complete clouds.
+        part_names: K part names, in the order of `part_id`.
+        joint_types: J joint types, 0 revolute, 1 prismatic.
+        articulation_range: J pairs (lower, upper) of the sampled joint states, relative to the rest state; radians, or
+            length / rest-state bounding-box diagonal.
+        instances: Instance ids of each split; `instance` of the shards indexes into its split's ids.
+        rest_state: J joint coordinates at rest of every instance id; radians, or length in the units of the source
+            (divide by `scale` of a sample to compare with its `joint_state`).
+        shards: Shards of each split, in the order of the global sample index.
+        rejected_views: Views that were drawn again because a part showed too few points.
+        schema_version: Version of this file's format.
+    """
+
+    generator_version: str
+    options: dict[str, Any]
+    seed: int
+    category: str
+    source: str
+    view: str
+    protocol: str | None
+    part_names: tuple[str, ...]
+    joint_types: tuple[int, ...]
+    articulation_range: tuple[tuple[float, float], ...]
+    instances: dict[str, tuple[str, ...]]
+    rest_state: dict[str, tuple[float, ...]]
+    shards: dict[str, tuple[ShardEntry, ...]]
+    rejected_views: int = 0
+    schema_version: int = SCHEMA_VERSION
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if the fields contradict each other."""
+        if self.view not in VIEWS:
+            raise ValueError(f"view is {self.view!r}, expected one of {', '.join(VIEWS)}")
+        protocols = PROTOCOLS if self.view == "partial" else (None,)
+        if self.protocol not in protocols:
+            raise ValueError(f"protocol is {self.protocol!r}, expected one of {protocols} for {self.view} views")
+        for name in ("instances", "shards"):
+            if sorted(getattr(self, name)) != sorted(SPLITS):
+                raise ValueError(f"{name} names the splits {sorted(getattr(self, name))}, expected {sorted(SPLITS)}")
+        ids = [i for split in SPLITS for i in self.instances[split]]
+        if len(set(ids)) != len(ids):
+            raise ValueError("an instance id appears twice; splits must not share instances")
+        if set(self.rest_state) != set(ids):
+            raise ValueError("rest_state must name exactly the instances of the splits")
+        num_joints = len(self.joint_types)
+        if len(self.articulation_range) != num_joints or any(len(q) != num_joints for q in self.rest_state.values()):
+            raise ValueError(f"articulation_range and every rest_state must have {num_joints} entries, one per joint")
+        for split in SPLITS:
+            names = [shard.name for shard in self.shards[split]]
+            if len(set(names)) != len(names) or any(Path(name).name != name for name in names):
+                raise ValueError(f"shard names of split {split!r} must be distinct plain file names")
+
+    @property
+    def num_parts(self) -> int:
+        """K."""
+        return len(self.part_names)
+
+    def num_samples(self, split: str) -> int:
+        """Number of samples of a split."""
+        return sum(shard.samples for shard in self.shards[split])
+
+    def save(self, folder: str | os.PathLike) -> None:
+        """Write `manifest.json` into `folder`, atomically; equal manifests give equal bytes."""
+        text = json.dumps(asdict(self), indent=2, sort_keys=True, allow_nan=False) + "\n"
+        with atomic_write(Path(folder) / MANIFEST_NAME) as file:
+            file.write(text.encode())
+
+    @classmethod
+    def load(cls, folder: str | os.PathLike) -> Manifest:
+        """Read `manifest.json` of a data set folder.
+
+        Raises:
+            ManifestError: if it is missing, not JSON, of another schema version, or contradicts itself.
+        """
+        path = Path(folder) / MANIFEST_NAME
+        remedy = "Remove the folder and make the set again with `make data`."
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError as error:
+            raise ManifestError(f"{path}: manifest is missing. Make or complete the set with `make data`.") from error
+        except ValueError as error:
+            raise ManifestError(f"{path}: manifest is not valid JSON ({error}). {remedy}") from error
+        if not isinstance(content, dict):
+            raise ManifestError(f"{path}: manifest is not a JSON object. {remedy}")
+        if (version := content.get("schema_version")) != SCHEMA_VERSION:
+            raise ManifestError(
+                f"{path}: schema version is {version!r}, this program reads version {SCHEMA_VERSION}. {remedy}"
+            )
+        expected = {field.name for field in fields(cls)}
+        if difference := expected.symmetric_difference(content):
+            kind = "missing" if difference & expected else "unknown"
+            raise ManifestError(f"{path}: manifest has {kind} fields: {', '.join(sorted(difference))}. {remedy}")
+        try:
+            return cls(
+                **content
+                | {
+                    "part_names": tuple(content["part_names"]),
+                    "joint_types": tuple(content["joint_types"]),
+                    "articulation_range": tuple((low, high) for low, high in content["articulation_range"]),
+                    "instances": {split: tuple(ids) for split, ids in content["instances"].items()},
+                    "rest_state": {instance: tuple(state) for instance, state in content["rest_state"].items()},
+                    "shards": {s: tuple(ShardEntry(**entry) for entry in e) for s, e in content["shards"].items()},
+                }
+            )
+        except (ValueError, TypeError, AttributeError) as error:
+            raise ManifestError(f"{path}: manifest is damaged: {error}. {remedy}") from error
+
+
+def set_folder(
+    root: str | os.PathLike,
+    category: str,
+    source: str = "procedural",
+    view: str = "complete",
+    protocol: str | None = None,
+) -> Path:
+    """Folder of a data set: `<root>/<category>/<source>-<view>[-<protocol>]`."""
+    return Path(root) / category / "-".join(part for part in (source, view, protocol) if part)
