@@ -1,0 +1,1 @@
+"""Methods to compare with, scored by the same metrics."""

@@ -1,0 +1,187 @@
+"""Every number that is reported for an articulated category: per-cloud errors and their statistics."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torchmetrics import Metric
+from torchmetrics.utilities import dim_zero_cat
+
+from articulate_ssl.metrics.calibration import (
+    Calibration,
+    check_labels,
+    dense_prediction,
+    gather_joints,
+    match_joints,
+)
+from articulate_ssl.metrics.functional import (
+    axis_angle_error,
+    chamfer_l1,
+    iou_matrix,
+    legacy_axis_error,
+    legacy_chamfer,
+    legacy_fold,
+    legacy_pivot_error,
+    legacy_rematch,
+    line_to_line_distance,
+    rotation_error,
+    state_error,
+    translation_error,
+)
+from articulate_ssl.metrics.statistics import summarize
+from articulate_ssl.prediction import Prediction
+from datamodules.geometry import REVOLUTE, transform_points
+
+PER_PART = ("r_err_deg", "t_err", "flip_rate", "seg_miou", "legacy_r_err_deg", "legacy_t_err", "legacy_seg_miou")
+PER_JOINT = ("axis_err_deg", "pivot_err", "state_err", "legacy_pivot_err")
+PER_CLOUD = ("chamfer_l1", "legacy_axis_err_deg", "legacy_chamfer_l1")
+FLIP_DEG = 90.0
+
+
+def part_pose_errors(
+    prediction: Prediction,
+    labels: dict[str, Tensor],
+    calibration: Calibration,
+    slot: Tensor,  # [B, K], the slot that is compared with every part
+) -> tuple[Tensor, Tensor]:  # [B, K] radians, [B, K] diagonal units
+    """Rotation and translation errors of every part.
+
+    A part's translation is the position of its bounding-box centre (the paper centralises bounding boxes): the slot's
+    pose applied to the residual centre of training, against the true pose applied to the true centre.
+    """
+    pose = gather_joints(prediction.part_pose, slot)
+    residual = calibration.part_of_slot[slot]  # residuals belong to slots, whatever part a slot is compared with
+    target = labels["part_pose"].double()
+    rotation = rotation_error(pose[..., :3, :3] @ calibration.residual_rotation[residual], target[..., :3, :3])
+    center = transform_points(pose, calibration.residual_center[residual][..., None, :])
+    target_center = transform_points(target, labels["part_center"].double()[..., None, :])
+    return rotation, translation_error(center, target_center).squeeze(-1)
+
+
+@torch.no_grad()
+def cloud_errors(
+    prediction: Prediction,
+    labels: dict[str, Tensor],
+    calibration: Calibration,
+) -> dict[str, Tensor]:
+    """Every error of every cloud, by its name in the report.
+
+    Returns:
+        [B, K] for part errors, [B, J] for joint errors, [B] for the rest; float64. Angles are in degrees. NaN only
+        where a quantity does not exist: the pivot of a prismatic joint, the IoU of a part that is in neither the
+        labelled nor the predicted segmentation.
+
+    Raises:
+        ValueError: if the labels do not belong to the prediction (`check_labels`).
+    """
+    check_labels(prediction, labels)
+    calibration = calibration.to(prediction.part_pose.device)
+    clouds, parts = prediction.part_pose.shape[:2]
+
+    iou = iou_matrix(dense_prediction(prediction, labels), labels["dense_part_id"], parts)  # [B, K slots, K parts]
+    slot = calibration.slot_of_part.expand(clouds, parts)
+    legacy_slot = legacy_rematch(iou)
+    rotation, translation = part_pose_errors(prediction, labels, calibration, slot)
+    legacy_rotation, legacy_translation = part_pose_errors(prediction, labels, calibration, legacy_slot)
+
+    joint, orientation = match_joints(
+        prediction,
+        calibration.part_of_slot,
+        calibration.joint_parent,
+        calibration.joint_child,
+        calibration.network_joint,
+    )
+    axis, pivot = gather_joints(prediction.joint_axis, joint), gather_joints(prediction.joint_pivot, joint)
+    target_axis, target_pivot = labels["joint_axis"].double(), labels["joint_pivot"].double()
+    revolute = (calibration.joint_type == REVOLUTE).expand(joint.shape)
+    state = calibration.state_sign * orientation * gather_joints(prediction.joint_state, joint)
+    state_err = state_error(state + calibration.state_offset, labels["joint_state"].double(), revolute)
+    points = labels["points"]
+    undefined = torch.full_like(state_err, torch.nan)
+    legacy_pivot = legacy_pivot_error(pivot, target_axis, target_pivot, points.double().mean(1))
+
+    reconstruction = transform_points(prediction.part_pose, prediction.part_shape).flatten(1, 2).to(points.dtype)
+    return {
+        "r_err_deg": rotation.rad2deg(),
+        "t_err": translation,
+        "flip_rate": (rotation.rad2deg() > FLIP_DEG).double(),
+        "axis_err_deg": axis_angle_error(axis, target_axis).rad2deg(),
+        "pivot_err": torch.where(revolute, line_to_line_distance(axis, pivot, target_axis, target_pivot), undefined),
+        "state_err": torch.where(revolute, state_err.rad2deg(), state_err),
+        "seg_miou": iou.gather(1, slot[:, None]).squeeze(1),
+        "chamfer_l1": chamfer_l1(points, reconstruction).double(),
+        "legacy_r_err_deg": legacy_fold(legacy_rotation).rad2deg(),
+        "legacy_t_err": legacy_translation,
+        "legacy_axis_err_deg": legacy_axis_error(axis, target_axis).rad2deg(),
+        "legacy_pivot_err": torch.where(revolute, legacy_pivot, undefined),
+        "legacy_seg_miou": iou.gather(1, legacy_slot[:, None]).squeeze(1),
+        "legacy_chamfer_l1": legacy_chamfer(points, reconstruction).double(),
+    }
+
+
+class ArticulatedPoseMetrics(Metric):
+    """Errors of all clouds of a test set, kept per cloud, with mean, median and bootstrap interval over instances.
+
+    Args:
+        calibration: Of this network on the training clouds of this category.
+        replicates: Bootstrap replicates.
+        seed: Of the bootstrap.
+    """
+
+    full_state_update = False
+    is_differentiable = False
+
+    def __init__(self, calibration: Calibration, replicates: int = 1000, seed: int = 0) -> None:
+        super().__init__()
+        self.calibration = calibration
+        self.replicates = replicates
+        self.seed = seed
+        for name in ("instance", *PER_PART, *PER_JOINT, *PER_CLOUD):
+            self.add_state(name, default=[], dist_reduce_fx="cat")
+
+    def update(self, prediction: Prediction, labels: dict[str, Tensor]) -> None:
+        """Add the clouds of a batch; every one counts.
+
+        Args:
+            prediction: B clouds.
+            labels: shard arrays of the same clouds; `points` [B, N, 3] are the clouds the network saw.
+
+        Raises:
+            ValueError: if the labels do not belong to the prediction.
+        """
+        for name, errors in cloud_errors(prediction, labels, self.calibration).items():
+            getattr(self, name).append(errors)
+        self.instance.append(labels["instance"].long())
+
+    def compute(self) -> dict:
+        """Statistics of everything seen.
+
+        Returns:
+            For every quantity of design section 4 a dict with `mean`, `median` and `ci95` (bootstrap over instances, of
+            the mean; None with fewer than two instances) of each cloud's average over its parts or joints, and the same
+            three for every single part or joint in the lists `parts` or `joints`. `flip_rate` has a cloud count as
+            flipped if any part is. Values that do not exist (the pivot of a prismatic joint) are None. Beside them
+            `samples` and `failures` (0: no cloud is ever dropped).
+
+        Raises:
+            ValueError: if nothing was added.
+        """
+        if not len(self.instance):
+            raise ValueError("no test cloud was scored: the test set is empty")
+        instance = dim_zero_cat(self.instance)
+        result: dict = {}
+        for name in (*PER_PART, *PER_JOINT, *PER_CLOUD):
+            values = dim_zero_cat(getattr(self, name))
+            if values.ndim == 1:
+                result[name] = self._summary(values, instance)
+                continue
+            average = values.amax(1) if name == "flip_rate" else values.nanmean(1)
+            if name == "state_err" and len({*self.calibration.joint_type.tolist()}) > 1:
+                average = torch.full_like(average, torch.nan)  # degrees and lengths have no common mean
+            result[name] = self._summary(average, instance)
+            single = "parts" if name in PER_PART else "joints"
+            result[name][single] = [self._summary(column, instance) for column in values.unbind(1)]
+        return result | {"samples": len(instance), "failures": 0}
+
+    def _summary(self, values: Tensor, instance: Tensor) -> dict:
+        return summarize(values, instance, self.replicates, self.seed)
