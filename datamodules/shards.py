@@ -15,7 +15,7 @@ Symbols: S samples, P points of a cloud, K parts, J joints. Everything is in nor
     joint_type       0 revolute, 1 prismatic
     instance         index into `Manifest.instances[split]`
     object_rotation  canonical object frame -> camera space
-    center, scale    of the normalisation, in the units of the source
+    center, scale    of the normalisation, camera space, in the units of the source
 
 A shard is an uncompressed zip of npy files with fixed time stamps, so equal arrays give equal bytes. Every array starts
 at a multiple of 64 bytes, so readers map it into memory instead of reading it.
@@ -120,7 +120,7 @@ def read_shard(path: str | os.PathLike, expected_sha256: str | None = None) -> d
         raise ShardError(f"{path}: shard is missing. Repeat the `make data` command that made the set to complete it.")
     if expected_sha256 is not None and (actual := sha256_of(path)) != expected_sha256:
         raise ShardError(
-            f"{path}: shard is damaged: its SHA-256 starts {actual[:12]}, the manifest says {expected_sha256[:12]}. {REPAIR}"
+            f"{path}: shard is damaged: its SHA-256 is {actual[:12]}…, not {expected_sha256[:12]}…. {REPAIR}"
         )
     try:
         arrays = _map_npz(path)

@@ -1,0 +1,184 @@
+"""One split of a generated set, fetched a whole batch at a time."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import roma
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from datamodules.geometry import se3
+from datamodules.manifest import Manifest
+from datamodules.shards import SHARD_ARRAYS, ShardError, read_shard, sha256_of
+
+POINT_ARRAYS = ("points", "part_id")
+LABEL_ARRAYS = tuple(name for name in SHARD_ARRAYS if name not in POINT_ARRAYS)
+INPUTS = ("points", "dense_points", "sample")
+
+Batch = dict[str, Tensor]
+
+
+def split_labels(batch: Batch) -> tuple[Batch, Batch]:
+    """What a model's `forward` may see (`points`, `dense_points`, `sample`), and what only metrics may read."""
+    inputs = {name: value for name, value in batch.items() if name in INPUTS}
+    labels = {name: value for name, value in batch.items() if name not in INPUTS}
+    return inputs, labels
+
+
+class ArticulatedDataset(Dataset):
+    """Clouds and labels of one split as batches of tensors.
+
+    The clouds stay mapped into memory; the small arrays are held in it. Random rotation and noise are a pure function
+    of (`seed`, key), whatever the number of workers and ranks and wherever a run was interrupted.
+
+    Args:
+        folder: Data set folder, `<root>/<category>/<source>-<view>[-<protocol>]`.
+        split: `train` or `test`.
+        num_points: N, size of the network's input.
+        rotate: Turn every cloud, and its labels, by a uniformly random rotation about the origin.
+        noise_std: Standard deviation of Gaussian noise per coordinate, in normalised units.
+        dense: Also deliver `dense_points` and `dense_part_id`.
+        seed: Of rotation and noise.
+        verify: Compare every shard with its checksum, once per file and process.
+
+    Raises:
+        ManifestError, ShardError: if a file is missing or damaged.
+        ValueError: if the split is empty or its clouds have fewer than `num_points` points.
+    """
+
+    def __init__(
+        self,
+        folder: str | os.PathLike,
+        split: str,
+        num_points: int = 512,
+        rotate: bool = False,
+        noise_std: float = 0.0,
+        dense: bool = True,
+        seed: int = 0,
+        verify: bool = True,
+    ) -> None:
+        self._options = (folder, split, num_points, rotate, noise_std, dense, seed)
+        self.num_points, self.rotate, self.noise_std, self.dense, self.seed = num_points, rotate, noise_std, dense, seed
+        manifest = Manifest.load(folder)
+        if not manifest.shards[split]:
+            raise ValueError(f"{folder}: the {split} split has no samples. Make the set again with `make data`.")
+        shards = [
+            self._open(Path(folder) / split / e.name, e.samples, e.sha256, verify) for e in manifest.shards[split]
+        ]
+        self._points = [shard["points"] for shard in shards]
+        self._part_id = [shard["part_id"] for shard in shards]
+        sizes = {points.shape[1] for points in self._points}
+        if len(sizes) > 1:
+            raise ShardError(f"{folder}: shards of the {split} split have clouds of different sizes {sorted(sizes)}.")
+        if (available := sizes.pop()) < num_points:
+            raise ValueError(f"{folder}: clouds have {available} points, num_points={num_points} asks for more.")
+        self.labels = {name: np.concatenate([shard[name] for shard in shards]) for name in LABEL_ARRAYS}
+        self._starts = np.cumsum([0] + [len(points) for points in self._points])
+
+    @staticmethod
+    def _open(path: Path, samples: int, sha256: str, verify: bool) -> dict[str, np.ndarray]:
+        shard = read_shard(path)
+        if verify:
+            status = path.stat()
+            if _cached_sha256(path.resolve(), status.st_mtime_ns, status.st_size) != sha256:
+                shard = read_shard(path, sha256)
+        if len(shard["points"]) != samples:
+            raise ShardError(f"{path}: shard has {len(shard['points'])} samples, the manifest says {samples}.")
+        return shard
+
+    def __getstate__(self) -> tuple:
+        """Workers map the shards themselves instead of receiving them."""
+        return self._options
+
+    def __setstate__(self, options: tuple) -> None:
+        self.__init__(*options, verify=False)
+
+    def __len__(self) -> int:
+        return int(self._starts[-1])
+
+    def __getitems__(
+        self,
+        keys: Sequence[int] | Sequence[tuple[int, int]],  # B sample indices, or pairs (sample index, position)
+    ) -> Batch:
+        """A batch; see `ArticulatedDataModule` for its entries. A position draws a fresh rotation and fresh noise."""
+        keys = np.asarray(keys, dtype=np.int64)
+        index = keys if keys.ndim == 1 else keys[:, 0]
+        shard = np.searchsorted(self._starts, index, side="right") - 1
+        row = index - self._starts[shard]
+        points = torch.from_numpy(self._gather(self._points, shard, row))
+        batch = {name: torch.from_numpy(_widen(array[index])) for name, array in self.labels.items()}
+        if self.dense:
+            batch["dense_part_id"] = torch.from_numpy(_widen(self._gather(self._part_id, shard, row)))
+        points = self._augment(points, batch, keys)
+        if self.dense:
+            batch["dense_points"] = points
+        return batch | {"points": points[:, : self.num_points].contiguous(), "sample": torch.from_numpy(index.copy())}
+
+    def _gather(self, arrays: list[np.ndarray], shard: np.ndarray, row: np.ndarray) -> np.ndarray:
+        """Rows of the mapped arrays, only as many points of each as are wanted."""
+        wanted = arrays[0].shape[1] if self.dense else self.num_points
+        out = np.empty((len(row), wanted, *arrays[0].shape[2:]), arrays[0].dtype)
+        for i, (s, r) in enumerate(zip(shard.tolist(), row.tolist(), strict=True)):
+            out[i] = arrays[s][r, :wanted]
+        return out
+
+    def _augment(self, points: Tensor, batch: Batch, keys: np.ndarray) -> Tensor:
+        """Noisy, rotated points; turns the labels in `batch` along."""
+        if not (self.rotate or self.noise_std):
+            return points
+        # A counter-based generator starts anywhere in its stream at no cost; plain indices get streams of their own.
+        counters = [[0, key[-1], len(key), 0] for key in keys.reshape(len(keys), -1).tolist()]
+        streams = [np.random.Generator(np.random.Philox(key=self.seed, counter=counter)) for counter in counters]
+        quaternion = torch.from_numpy(np.stack([s.standard_normal(4) for s in streams]))
+        if self.noise_std:
+            noise = np.stack([s.standard_normal(points.shape[1:], dtype=np.float32) for s in streams])
+            points = points + self.noise_std * torch.from_numpy(noise)
+        if self.rotate:
+            rotation = roma.unitquat_to_rotmat(quaternion / quaternion.norm(dim=-1, keepdim=True)).float()
+            points = points @ rotation.mT
+            for name in ("joint_axis", "joint_pivot"):
+                batch[name] = batch[name] @ rotation.mT
+            batch["center"] = (rotation @ batch["center"][..., None]).squeeze(-1)
+            batch["object_rotation"] = rotation @ batch["object_rotation"]
+            batch["part_pose"] = se3(rotation, rotation.new_zeros(3))[:, None] @ batch["part_pose"]
+        return points
+
+
+def spread_subset(
+    instance: np.ndarray,  # [S] instance of every sample, in stored order (state by state)
+    size: int,
+) -> np.ndarray:  # [min(S, size)] ascending sample indices
+    """A deterministic subset spread evenly over instances and, within each, over the stored order.
+
+    Every instance's samples are cut into equal intervals with one random sample from each: a fixed step could fall in
+    with the number of rotations or views per state and pick the same one every time.
+    """
+    generator = np.random.default_rng(0)
+    instances = np.unique(instance)
+    quota = np.zeros(len(instances), dtype=np.int64)
+    members = [np.flatnonzero(instance == i) for i in instances]
+    capacity = np.array([len(m) for m in members])
+    for _ in range(min(size, len(instance))):
+        quota[np.argmin(np.where(quota < capacity, quota / capacity, np.inf))] += 1
+    chosen = []
+    for samples, n in zip(members, quota.tolist(), strict=True):
+        edges = np.linspace(0, len(samples), n + 1).astype(np.int64)
+        chosen.append(samples[generator.integers(edges[:-1], edges[1:])])
+    return np.sort(np.concatenate(chosen))
+
+
+def _widen(array: np.ndarray) -> np.ndarray:
+    """Integers as int64, torch's index type; floats as they are."""
+    return array if array.dtype.kind == "f" else array.astype(np.int64)
+
+
+@cache
+def _cached_sha256(path: Path, mtime_ns: int, size: int) -> str:
+    """Checksum of a file that has not changed since, as far as its modification time and size tell."""
+    return sha256_of(path)
