@@ -1,0 +1,115 @@
+"""The equivariant backbone: a stack of group convolutions (EPN, Chen et al. 2021; paper Sec. 3.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import leaky_relu
+
+from articulate_ssl.groups import RotationGroup, rotation_group
+from articulate_ssl.network.pose_aware_convolution import canonicalize
+from articulate_ssl.ops.group_convolution import group_convolution
+from articulate_ssl.ops.kernel_points import KernelPoints, symmetric_kernel_points
+from articulate_ssl.ops.neighborhood import Neighborhood, correlate, nearest_neighbors
+
+
+class GroupConvolutionBlock(nn.Module):
+    """Group convolution -> normalisation -> LeakyReLU.
+
+    Layer normalisation over the channels of each point and group element commutes with the action of the group and
+    mixes neither points nor samples, so a cloud's features do not depend on the rest of its batch.
+    """
+
+    def __init__(self, in_channels: int, out_channels: int, kernel: KernelPoints) -> None:
+        super().__init__()
+        num_points = len(kernel.points)
+        self.weight = nn.Parameter(torch.empty(num_points, in_channels, out_channels))
+        # Xavier for the fan-in of the whole kernel, with the gain of ReLU (as the original).
+        nn.init.normal_(self.weight, std=2 / (in_channels * num_points + out_channels) ** 0.5)
+        self.norm = nn.LayerNorm(out_channels)
+        self.register_buffer("permutation", kernel.permutation, persistent=False)
+
+    def forward(
+        self,
+        features: Tensor | None,  # [B, N, G, C], or None for the constant one
+        neighborhood: Neighborhood,
+    ) -> Tensor:  # [B, M, G, C']
+        features = group_convolution(features, neighborhood, self.weight, self.permutation)
+        return leaky_relu(self.norm(features), negative_slope=0.01)
+
+
+class EquivariantBackbone(nn.Module):
+    """Features of every point and group element, equivariant under the group and invariant to translation.
+
+    Args:
+        group_order: 12, 24 or 60.
+        dims: channels of each layer's output.
+        radii: ball radius of each layer; the rest-state bounding-box diagonal of the object is 1.
+        num_neighbors: at most this many nearest points per ball.
+        num_kernel_points: see `symmetric_kernel_points`.
+        num_centers: for each layer, how many leading points remain (points come in farthest-point order, so a prefix
+            covers the cloud); None keeps all of them everywhere.
+    """
+
+    group: RotationGroup
+
+    def __init__(
+        self,
+        group_order: int = 60,
+        dims: Sequence[int] = (64, 128, 512),
+        radii: Sequence[float] = (0.08, 0.16, 0.2263),
+        num_neighbors: int = 64,
+        num_kernel_points: int = 24,
+        num_centers: Sequence[int] | None = None,
+    ) -> None:
+        super().__init__()
+        if len(radii) != len(dims) or (num_centers is not None and len(num_centers) != len(dims)):
+            raise ValueError(
+                f"dims, radii and num_centers state one value per layer, got {dims}, {radii}, {num_centers}"
+            )
+        self.group = rotation_group(group_order)
+        self.radii = tuple(radii)
+        self.num_neighbors = num_neighbors
+        self.num_centers = None if num_centers is None else tuple(num_centers)
+        self.out_channels = dims[-1]
+        kernel = symmetric_kernel_points(self.group, num_kernel_points)
+        self.register_buffer("kernel_points", kernel.points, persistent=False)
+        self.blocks = nn.ModuleList(
+            GroupConvolutionBlock(c_in, c_out, kernel) for c_in, c_out in zip((1, *dims[:-1]), dims, strict=True)
+        )
+
+    def neighborhoods(
+        self,
+        points: Tensor,  # [B, N, 3]
+    ) -> list[Neighborhood]:
+        """The geometry of every layer; layers with the same input and output points share one neighbour search."""
+        B, N = points.shape[:2]
+        found = {}
+        neighborhoods = []
+        for layer, radius in enumerate(self.radii):
+            M = N if self.num_centers is None else min(N, self.num_centers[layer])
+            if (N, M) not in found:
+                centers = None if M == N else torch.arange(M, device=points.device).expand(B, M)
+                found[N, M] = nearest_neighbors(points[:, :N], self.num_neighbors, centers)
+            neighborhoods.append(correlate(found[N, M], radius, self.kernel_points, N))
+            N = M
+        return neighborhoods
+
+    def forward(
+        self,
+        points: Tensor,  # [B, N, 3]
+        poses: Tensor | None = None,  # [B, N, 4, 4] canonical -> camera space, of each point's part
+    ) -> Tensor:  # [B, M, G, C]
+        """Features in the frame of `points`, or with `poses` pose-aware features in the canonical frame.
+
+        Pose-aware convolution is plain convolution of the cloud with every part moved back to canonical space
+        (`pose_aware_convolution`).
+        """
+        if poses is not None:
+            points = canonicalize(points, poses)
+        features = None
+        for block, neighborhood in zip(self.blocks, self.neighborhoods(points), strict=True):
+            features = block(features, neighborhood)
+        return features

@@ -1,0 +1,1 @@
+"""Fast group-equivariant operators; `ops.reference` holds their readable twins."""
