@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -88,6 +89,23 @@ class ArticulatedObject:
         parents, children = [j.parent for j in self.joints], [j.child for j in self.joints]
         return forward_kinematics(motion, parents, children, self.num_parts).numpy()
 
+    def at_rest(self, states: Sequence[float]) -> ArticulatedObject:
+        """The same object with meshes, axes and pivots stored at other joint coordinates."""
+        motion = self.part_motion(np.asarray(states))
+        meshes = tuple(mesh.copy() for mesh in self.meshes)
+        for mesh, matrix in zip(meshes, motion, strict=True):
+            mesh.apply_transform(matrix)
+        joints = tuple(
+            replace(
+                joint,
+                rest=float(state),
+                axis=motion[joint.parent, :3, :3] @ joint.axis,
+                pivot=motion[joint.parent, :3, :3] @ joint.pivot + motion[joint.parent, :3, 3],
+            )
+            for joint, state in zip(self.joints, states, strict=True)
+        )
+        return replace(self, meshes=meshes, joints=joints)
+
     def validate(self) -> ArticulatedObject:
         """Return self if sound.
 
@@ -112,7 +130,9 @@ class ArticulatedObject:
             if joint.type not in (REVOLUTE, PRISMATIC):
                 fail(f"joint {joint.name!r} has unknown type {joint.type}")
             if not (0 <= joint.parent < self.num_parts and 0 <= joint.child < self.num_parts):
-                fail(f"joint {joint.name!r} connects parts {joint.parent} and {joint.child}, outside 0..{self.num_parts - 1}")
+                fail(
+                    f"joint {joint.name!r} connects parts {joint.parent} and {joint.child}, outside 0..{self.num_parts - 1}"
+                )
             values = (*joint.axis, *joint.pivot, joint.lower, joint.upper, joint.rest)
             if not np.isfinite(values).all():
                 fail(f"joint {joint.name!r} has NaN or infinite axis, pivot or limits")
@@ -121,7 +141,9 @@ class ArticulatedObject:
             if joint.lower > joint.upper:
                 fail(f"joint {joint.name!r} has reversed limits [{joint.lower}, {joint.upper}]")
         if sorted(children) != [k for k in range(self.num_parts) if k != self.base]:
-            fail(f"every part except the base ({self.base}) must be the child of one joint; children are {sorted(children)}")
+            fail(
+                f"every part except the base ({self.base}) must be the child of one joint; children are {sorted(children)}"
+            )
         try:
             self.part_motion(np.array([j.rest for j in self.joints]))
         except ValueError as error:

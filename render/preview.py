@@ -1,6 +1,6 @@
 """Contact sheet of a category: what its instances look like, how they move, and what a depth camera sees of them.
 
-    python -m render.preview --category laptop --out build/preview
+python -m render.preview --category laptop --out build/preview
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ from scipy.ndimage import laplace
 from render.articulated_object import ArticulatedObject
 
 # Base in grey, moving parts in the colour-blind safe palette of Okabe and Ito.
-PART_COLORS = np.array([(0.72, 0.73, 0.75), (0.90, 0.62, 0.0), (0.34, 0.71, 0.91), (0.0, 0.62, 0.45), (0.80, 0.47, 0.65)])
+PART_COLORS = np.array(
+    [(0.72, 0.73, 0.75), (0.90, 0.62, 0.0), (0.34, 0.71, 0.91), (0.0, 0.62, 0.45), (0.80, 0.47, 0.65)]
+)
 FIELD_OF_VIEW = np.deg2rad(28.0)
 _CREASE_STEP = 0.01  # relative depth step between neighbouring pixels that is drawn black
 

@@ -1,0 +1,1 @@
+"""One YAML file per category; `render.category.CategorySpec` documents the fields."""

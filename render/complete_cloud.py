@@ -1,0 +1,132 @@
+"""Complete clouds: uniform by area over the surface a sensor could reach, then farthest-point sampled."""
+
+from __future__ import annotations
+
+import numpy as np
+import open3d as o3d
+import trimesh
+
+from render.articulated_object import ArticulatedObject
+from render.farthest_point import farthest_point_order
+
+POOL_SIZE = 32768  # reachable candidates per instance
+OVERSAMPLING = 2  # candidates per stored point
+NUM_DIRECTIONS = 64
+_MAX_DRAWS = 16
+
+
+class ReachableSurface:
+    """Points of an instance's surface that a distant sensor sees from some direction in some articulation state.
+
+    Interior faces of CAD meshes and faces buried in other parts are thereby left out.
+
+    Attributes:
+        points: [M, 3] in the object frame at rest, uniform by area over the reachable surface.
+        part_id: [M] part of every point.
+    """
+
+    def __init__(
+        self,
+        instance: ArticulatedObject,
+        states: np.ndarray,  # [V, J] articulation states in which to look
+        rng: np.random.Generator,
+        pool_size: int = POOL_SIZE,
+    ) -> None:
+        """Draw the pool.
+
+        Raises:
+            ValueError: if hardly any surface can be reached, or none of some part.
+        """
+        self.instance = instance
+        scenes = [_Scene(instance, instance.part_motion(q)) for q in states]
+        drawn_points, drawn_part, reached = [], [], 0
+        for _ in range(_MAX_DRAWS):
+            points, part_id = sample_surface(instance, pool_size, rng)
+            visible = np.zeros(len(points), dtype=bool)
+            for scene in scenes:
+                hidden = np.flatnonzero(~visible)
+                visible[hidden] = scene.reaches(points[hidden], part_id[hidden])
+            drawn_points.append(points[visible])
+            drawn_part.append(part_id[visible])
+            reached += int(visible.sum())
+            if reached >= pool_size:
+                break
+        else:
+            raise ValueError(
+                f"{instance.category} instance {instance.name!r}: a sensor reaches only {reached} of "
+                f"{_MAX_DRAWS * pool_size} surface points; its meshes are nested in each other"
+            )
+        self.points = np.concatenate(drawn_points)[:pool_size]
+        self.part_id = np.concatenate(drawn_part)[:pool_size]
+        for part, name in enumerate(instance.part_names):
+            if not (self.part_id == part).any():
+                raise ValueError(f"{instance.category} instance {instance.name!r}: no sensor reaches part {name!r}")
+
+    def cloud(
+        self,
+        motion: np.ndarray,  # [K, 4, 4]
+        num_points: int,
+        rng: np.random.Generator,
+    ) -> tuple[np.ndarray, np.ndarray]:  # [num_points, 3] and [num_points]
+        """A complete cloud of the posed instance and its part ids, in farthest-point order."""
+        size = min(OVERSAMPLING * num_points, len(self.points))
+        chosen = rng.choice(len(self.points), size, replace=False, shuffle=False)
+        posed = move_parts(self.points[chosen], self.part_id[chosen], motion)
+        order = farthest_point_order(posed, num_points)
+        return posed[order], self.part_id[chosen[order]]
+
+
+def sample_surface(
+    instance: ArticulatedObject, count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:  # [count, 3] and [count]
+    """Points uniform by area over all part meshes at rest, and their part ids."""
+    whole = trimesh.util.concatenate(instance.meshes)
+    face_part = np.repeat(np.arange(instance.num_parts), [len(mesh.faces) for mesh in instance.meshes])
+    points, faces = trimesh.sample.sample_surface(whole, count, seed=int(rng.integers(2**63)))
+    return np.asarray(points), face_part[faces].astype(np.uint8)
+
+
+def move_parts(
+    points: np.ndarray,  # [N, 3]
+    part_id: np.ndarray,  # [N]
+    motion: np.ndarray,  # [K, 4, 4]
+) -> np.ndarray:  # [N, 3]
+    """Every point moved with its part."""
+    moved = np.empty_like(points)
+    for part, matrix in enumerate(motion):
+        mine = part_id == part
+        moved[mine] = points[mine] @ matrix[:3, :3].T + matrix[:3, 3]
+    return moved
+
+
+class _Scene:
+    """The posed instance, ready for occlusion tests from distant sensors."""
+
+    def __init__(self, instance: ArticulatedObject, motion: np.ndarray) -> None:
+        self.motion = motion
+        self.gap = 1e-4 * instance.rest_diagonal
+        self.caster = o3d.t.geometry.RaycastingScene(nthreads=1)
+        for mesh, matrix in zip(instance.meshes, motion, strict=True):
+            vertices = trimesh.transform_points(mesh.vertices, matrix)
+            self.caster.add_triangles(vertices.astype(np.float32), mesh.faces.astype(np.uint32))
+
+    def reaches(self, points: np.ndarray, part_id: np.ndarray) -> np.ndarray:  # [N] bool
+        """Whether the line from a point to infinity is free in one of many directions."""
+        posed = move_parts(points, part_id, self.motion).astype(np.float32)
+        free = np.zeros(len(points), dtype=bool)
+        for direction in fibonacci_sphere(NUM_DIRECTIONS).astype(np.float32):
+            hidden = np.flatnonzero(~free)
+            rays = np.empty((len(hidden), 6), dtype=np.float32)
+            rays[:, :3] = posed[hidden] + self.gap * direction
+            rays[:, 3:] = direction
+            free[hidden] = ~self.caster.test_occlusions(rays, nthreads=1).numpy()
+        return free
+
+
+def fibonacci_sphere(count: int) -> np.ndarray:  # [count, 3]
+    """Nearly even unit directions, in an order that alternates between the hemispheres."""
+    k = np.arange(count)
+    y = 1 - (2 * k + 1) / count
+    radius, angle = np.sqrt(1 - y * y), np.pi * (3 - np.sqrt(5)) * k
+    directions = np.stack([radius * np.cos(angle), y, radius * np.sin(angle)], axis=1)
+    return directions[np.argsort(np.minimum(k, count - 1 - k) * 2 + (k >= count / 2))]

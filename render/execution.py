@@ -1,0 +1,66 @@
+"""Running shard tasks: in this process, in spawned processes, or on a Dask cluster."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+
+from render.shard_task import ShardResult, ShardTask, make_shard
+
+# Read by the numerical libraries when a worker imports them: parallelism comes from workers, not from threads.
+_ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "LP_NUM_THREADS")}
+
+
+def run_tasks(tasks: list[ShardTask], workers: int, scheduler: str | None = None) -> Iterator[ShardResult]:
+    """Results in the order in which they finish. The first error of a task ends the run.
+
+    Args:
+        tasks: What to make.
+        workers: Number of processes; 1 works in the calling process.
+        scheduler: Address of a Dask scheduler (`tcp://…`) to use instead; its workers must see the same folders.
+
+    Raises:
+        ValueError, OSError: from a task, or if the scheduler cannot be reached.
+    """
+    if scheduler is not None:
+        yield from _run_dask(tasks, scheduler)
+    elif workers == 1 or len(tasks) < 2:
+        yield from map(make_shard, tasks)
+    else:
+        yield from _run_pool(tasks, workers)
+
+
+def _run_pool(tasks: list[ShardTask], workers: int) -> Iterator[ShardResult]:
+    # Spawn, not fork: a fork after a GL context was used hangs.
+    context = multiprocessing.get_context("spawn")
+    previous = {name: os.environ.get(name) for name in _ONE_THREAD}
+    os.environ.update(_ONE_THREAD)
+    try:
+        with ProcessPoolExecutor(min(workers, len(tasks)), mp_context=context) as pool:
+            futures = [pool.submit(make_shard, task) for task in tasks]
+            try:
+                for future in as_completed(futures):
+                    yield future.result()
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+    finally:
+        for name, value in previous.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _run_dask(tasks: list[ShardTask], scheduler: str) -> Iterator[ShardResult]:
+    try:
+        from dask.distributed import Client, as_completed
+    except ImportError as error:
+        raise ValueError("--scheduler needs Dask: pip install 'articulate-ssl[dask]'") from error
+    with Client(scheduler) as client:
+        # Not pure: a shard that was deleted must be written again, whatever Dask remembers of it.
+        futures = client.map(make_shard, tasks, pure=False)
+        for _, result in as_completed(futures, with_results=True):
+            yield result

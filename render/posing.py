@@ -1,0 +1,54 @@
+"""Which articulation states and global rotations of an instance become samples, and the labels that follow from them."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import qmc
+
+from render.articulated_object import ArticulatedObject
+
+
+def sample_states(
+    ranges: list[tuple[float, float]],
+    num_states: int,
+    rng: np.random.Generator,
+) -> np.ndarray:  # [num_states, J]
+    """Articulation states by Latin hypercube sampling: every joint alone covers its range [lower, upper) evenly."""
+    lower, upper = np.array(ranges).reshape(-1, 2).T
+    unit = qmc.LatinHypercube(len(ranges), rng=rng).random(num_states)
+    return lower + unit * (upper - lower)
+
+
+def sample_rotation(rng: np.random.Generator) -> np.ndarray:  # [3, 3]
+    """A rotation uniform on SO(3)."""
+    return Rotation.random(rng=rng).as_matrix()
+
+
+def pose_labels(
+    instance: ArticulatedObject,
+    states: np.ndarray,  # [J]
+    rotation: np.ndarray,  # [3, 3]
+    translation: np.ndarray,  # [3], so that camera = rotation @ object + translation
+    center: np.ndarray,  # [3], camera frame
+    scale: float,
+) -> dict[str, np.ndarray]:
+    """The pose and joint arrays of one sample of a shard, named and defined as in `datamodules.shards` (float64)."""
+    motion = instance.part_motion(states)  # [K, 4, 4]
+    pose = motion.copy()
+    pose[:, :3, :3] = rotation @ motion[:, :3, :3]
+    pose[:, :3, 3] = (motion[:, :3, 3] @ rotation.T + translation - center) / scale
+    parent = [joint.parent for joint in instance.joints]
+    axis = np.array([joint.axis for joint in instance.joints]).reshape(-1, 3)
+    pivot = np.array([joint.pivot for joint in instance.joints]).reshape(-1, 3) / scale
+    prismatic = np.array([joint.type for joint in instance.joints], dtype=bool)
+    return {
+        "part_pose": pose,
+        "joint_axis": np.einsum("jab,jb->ja", pose[parent, :3, :3], axis),
+        "joint_pivot": np.einsum("jab,jb->ja", pose[parent, :3, :3], pivot) + pose[parent, :3, 3],
+        "joint_state": np.where(prismatic, states / scale, states),
+        "part_center": np.array([mesh.bounds.mean(0) for mesh in instance.meshes]) / scale,
+        "object_rotation": rotation,
+        "center": center,
+        "scale": np.float64(scale),
+    }

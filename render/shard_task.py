@@ -1,0 +1,217 @@
+"""The unit of work of the generator: one shard, a function of the options and the shard's place in the set alone."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from datamodules.geometry import PRISMATIC
+from datamodules.shards import SHARD_ARRAYS, write_shard
+from render.articulated_object import ArticulatedObject
+from render.category import load_category
+from render.complete_cloud import ReachableSurface
+from render.posing import pose_labels, sample_rotation, sample_states
+from render.seeds import generator_for
+from render.sources import open_source
+
+SAMPLES_PER_SHARD = 250
+_REACH_STATES = 3
+
+
+@dataclass(frozen=True)
+class SetOptions:
+    """Everything that decides the bytes of a data set.
+
+    Attributes:
+        category: One of `render.category.category_names()`.
+        source: One of `render.sources.SOURCES`.
+        root: Folder of an external source's data set.
+        view: `complete` or `partial`.
+        protocol: `honest` or `eap` for partial views, None for complete clouds.
+        seed: Of everything random.
+        train_instances: Number of training instances.
+        test_instances: Number of test instances.
+        states: Articulation states per instance.
+        rotations: Stored rotations of each complete test cloud; complete training clouds are stored once, unrotated.
+        views: Depth views of each articulation state.
+        resolution: Width and height of the depth images, pixels.
+        points: Points per cloud.
+        noise_std: Standard deviation of the depth noise, in units of the rest-state bounding-box diagonal.
+    """
+
+    category: str
+    source: str
+    root: str | None
+    view: str
+    protocol: str | None
+    seed: int
+    train_instances: int
+    test_instances: int
+    states: int
+    rotations: int
+    views: int
+    resolution: int
+    points: int
+    noise_std: float
+
+    def copies(self, split: str) -> int:
+        """Stored samples per articulation state."""
+        if self.view == "partial":
+            return self.views
+        return self.rotations if split == "test" else 1
+
+    def recorded(self) -> dict:
+        """The options as the manifest records them; of `root` only the folder name, wherever it lies."""
+        return asdict(self) | {"root": None if self.root is None else Path(self.root).resolve().name}
+
+
+@dataclass(frozen=True)
+class ShardTask:
+    """One shard: states `first_state` to `last_state` (exclusive) of one instance."""
+
+    options: SetOptions
+    folder: str
+    split: str
+    name: str
+    instance_index: int
+    instance_id: str
+    first_state: int
+    last_state: int
+
+
+@dataclass(frozen=True)
+class ShardResult:
+    """What the manifest needs to know about a finished shard and its instance.
+
+    Attributes:
+        rest_state: J joint coordinates at rest; radians, or length in the units of the source.
+        articulation_range: J pairs (lower, upper) relative to rest; radians, or length / rest-state diagonal.
+        rejected_views: Views drawn again because a part showed too few points.
+    """
+
+    split: str
+    name: str
+    samples: int
+    sha256: str
+    instance_id: str
+    rest_state: tuple[float, ...]
+    articulation_range: tuple[tuple[float, float], ...]
+    rejected_views: int
+
+
+def plan_shards(options: SetOptions, folder: Path, split: str, instance_ids: list[str]) -> list[ShardTask]:
+    """The shards of a split in order; independent of how many workers will make them."""
+    step = max(1, SAMPLES_PER_SHARD // options.copies(split))
+    places = [
+        (index, instance_id, first)
+        for index, instance_id in enumerate(instance_ids)
+        for first in range(0, options.states, step)
+    ]
+    return [
+        ShardTask(
+            options=options,
+            folder=str(folder),
+            split=split,
+            name=f"shard-{number:05d}.npz",
+            instance_index=index,
+            instance_id=instance_id,
+            first_state=first,
+            last_state=min(first + step, options.states),
+        )
+        for number, (index, instance_id, first) in enumerate(places)
+    ]
+
+
+def make_shard(task: ShardTask) -> ShardResult:
+    """Generate and write one shard.
+
+    Raises:
+        ValueError: if the instance is unsound or cannot be sampled.
+        OSError: if the shard cannot be written.
+    """
+    options, spec = task.options, load_category(task.options.category)
+    instance = _load_instance(options.category, options.source, options.root, options.seed, task.instance_id)
+    ranges = spec.sampled_ranges(instance)
+    all_states = sample_states(ranges, options.states, _generator(task, "states"))
+    samples = []
+    for state in range(task.first_state, task.last_state):
+        samples += _complete_samples(task, instance, all_states[state], state)
+    arrays = _stack(samples, instance, task.instance_index)
+    path = Path(task.folder) / task.split / task.name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rest = np.array([joint.rest for joint in instance.joints])
+    prismatic = np.array([joint.type == PRISMATIC for joint in instance.joints])
+    unit = np.where(prismatic, instance.rest_diagonal, 1.0)
+    return ShardResult(
+        split=task.split,
+        name=task.name,
+        samples=len(samples),
+        sha256=write_shard(path, arrays),
+        instance_id=task.instance_id,
+        rest_state=tuple(rest.tolist()),
+        articulation_range=tuple(map(tuple, ((np.array(ranges) - rest[:, None]) / unit[:, None]).tolist())),
+        rejected_views=0,
+    )
+
+
+def _generator(task: ShardTask, *key: str | int) -> np.random.Generator:
+    return generator_for(task.options.seed, task.split, task.instance_id, *key)
+
+
+def _complete_samples(
+    task: ShardTask, instance: ArticulatedObject, states: np.ndarray, index: int
+) -> list[dict[str, np.ndarray]]:
+    """One cloud of the articulation state, in one stored orientation (train) or in several (test)."""
+    options = task.options
+    surface = _reachable_surface(task.split, instance, options.seed, options.points)
+    cloud, part_id = surface.cloud(instance.part_motion(states), options.points, _generator(task, "cloud", index))
+    samples = []
+    for copy in range(options.copies(task.split)):
+        rotation = np.eye(3) if task.split == "train" else sample_rotation(_generator(task, "rotation", index, copy))
+        rotated = np.einsum("nb,ab->na", cloud, rotation)
+        center, scale = rotated.mean(0), instance.rest_diagonal
+        labels = pose_labels(instance, states, rotation, np.zeros(3), center, scale)
+        samples.append({"points": (rotated - center) / scale, "part_id": part_id, **labels})
+    return samples
+
+
+def _stack(samples: list[dict[str, np.ndarray]], instance: ArticulatedObject, index: int) -> dict[str, np.ndarray]:
+    """The arrays of a shard, with their dtypes."""
+    constant = {
+        "instance": index,
+        "joint_parent": [joint.parent for joint in instance.joints],
+        "joint_child": [joint.child for joint in instance.joints],
+        "joint_type": [joint.type for joint in instance.joints],
+    }
+    arrays = {}
+    for name, spec in SHARD_ARRAYS.items():
+        values = [constant[name]] * len(samples) if name in constant else [sample[name] for sample in samples]
+        arrays[name] = np.array(values, dtype=spec.dtype)
+    return arrays
+
+
+@lru_cache(maxsize=2)
+def _load_instance(category: str, source: str, root: str | None, seed: int, instance_id: str) -> ArticulatedObject:
+    """The validated instance in its category's rest state; kept for the next shard of the same instance."""
+    spec = load_category(category)
+    instance = open_source(source, spec, None if root is None else Path(root), seed).load(instance_id)
+    return spec.to_rest(instance.validate())
+
+
+_surfaces: dict[tuple, ReachableSurface] = {}
+
+
+def _reachable_surface(split: str, instance: ArticulatedObject, seed: int, num_points: int) -> ReachableSurface:
+    """The instance's pool of reachable points; kept for the next shard of the same instance."""
+    key = (split, instance.category, instance.name, seed, num_points)
+    if key not in _surfaces:
+        _surfaces.clear()
+        lower, upper = np.array(load_category(instance.category).sampled_ranges(instance)).T
+        states = np.linspace(lower, upper, _REACH_STATES)
+        _surfaces[key] = ReachableSurface(
+            instance, states, generator_for(seed, split, instance.name, "surface"), num_points
+        )
+    return _surfaces[key]

@@ -1,0 +1,50 @@
+"""Where articulated objects come from: five sources behind one interface."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import Protocol
+
+from render.articulated_object import ArticulatedObject
+from render.category import CategorySpec
+
+SOURCES = {name: f"render.sources.{name.replace('-', '_')}" for name in (
+    "procedural", "urdf", "partnet-mobility", "shape2motion", "hoi4d",
+)}  # fmt: skip
+
+
+class Source(Protocol):
+    """A collection of instances of one category.
+
+    Convention:
+        Objects arrive in the canonical object frame of `render.category` with the category's parts and joints, in its
+        order; meshes may be stored at any joint coordinate, `Joint.rest` says which.
+    """
+
+    def instance_ids(self) -> list[str]:
+        """Ids of all instances, in a fixed order."""
+
+    def load(self, instance_id: str) -> ArticulatedObject:
+        """The instance; the same object for every call.
+
+        Raises:
+            ValueError: naming the file, what is wrong with it and what to do.
+        """
+
+
+def open_source(name: str, spec: CategorySpec, root: Path | None, seed: int) -> Source:
+    """Open a source.
+
+    Args:
+        name: One of `SOURCES`.
+        spec: The category to make instances of.
+        root: Folder of the data set; None for the procedural source.
+        seed: Of the procedural designs; other sources ignore it.
+
+    Raises:
+        ValueError: if the source is unknown, or `root` does not hold a data set of its kind.
+    """
+    if name not in SOURCES:
+        raise ValueError(f"unknown source {name!r}; choose one of {', '.join(SOURCES)}")
+    return import_module(SOURCES[name]).open(spec, root, seed)
