@@ -13,6 +13,7 @@ from articulate_ssl.metrics.calibration import (
     dense_prediction,
     gather_joints,
     match_joints,
+    predicts_joints,
 )
 from articulate_ssl.metrics.functional import (
     axis_angle_error,
@@ -58,6 +59,39 @@ def part_pose_errors(
     return rotation, translation_error(center, target_center).squeeze(-1)
 
 
+def joint_errors(
+    prediction: Prediction,
+    labels: dict[str, Tensor],
+    calibration: Calibration,
+) -> dict[str, Tensor]:
+    """Errors of every joint, [B, J], and the legacy axis error, [B]; NaN where the method predicts no joints."""
+    target_axis, target_pivot = labels["joint_axis"].double(), labels["joint_pivot"].double()
+    undefined = torch.full_like(labels["joint_state"], torch.nan, dtype=torch.float64)
+    if not predicts_joints(prediction):
+        per_cloud = undefined.new_full((len(undefined),), torch.nan)
+        return dict.fromkeys(PER_JOINT, undefined) | {"legacy_axis_err_deg": per_cloud}
+    joint, orientation = match_joints(
+        prediction,
+        calibration.part_of_slot,
+        calibration.joint_parent,
+        calibration.joint_child,
+        calibration.network_joint,
+    )
+    axis, pivot = gather_joints(prediction.joint_axis, joint), gather_joints(prediction.joint_pivot, joint)
+    revolute = (calibration.joint_type == REVOLUTE).expand(joint.shape)
+    state = calibration.state_sign * orientation * gather_joints(prediction.joint_state, joint)
+    state_err = state_error(state + calibration.state_offset, labels["joint_state"].double(), revolute)
+    line_err = line_to_line_distance(axis, pivot, target_axis, target_pivot)
+    legacy_pivot = legacy_pivot_error(pivot, target_axis, target_pivot, labels["points"].double().mean(1))
+    return {
+        "axis_err_deg": axis_angle_error(axis, target_axis).rad2deg(),
+        "pivot_err": torch.where(revolute, line_err, undefined),
+        "state_err": torch.where(revolute, state_err.rad2deg(), state_err),
+        "legacy_axis_err_deg": legacy_axis_error(axis, target_axis).rad2deg(),
+        "legacy_pivot_err": torch.where(revolute, legacy_pivot, undefined),
+    }
+
+
 @torch.no_grad()
 def cloud_errors(
     prediction: Prediction,
@@ -84,38 +118,19 @@ def cloud_errors(
     rotation, translation = part_pose_errors(prediction, labels, calibration, slot)
     legacy_rotation, legacy_translation = part_pose_errors(prediction, labels, calibration, legacy_slot)
 
-    joint, orientation = match_joints(
-        prediction,
-        calibration.part_of_slot,
-        calibration.joint_parent,
-        calibration.joint_child,
-        calibration.network_joint,
-    )
-    axis, pivot = gather_joints(prediction.joint_axis, joint), gather_joints(prediction.joint_pivot, joint)
-    target_axis, target_pivot = labels["joint_axis"].double(), labels["joint_pivot"].double()
-    revolute = (calibration.joint_type == REVOLUTE).expand(joint.shape)
-    state = calibration.state_sign * orientation * gather_joints(prediction.joint_state, joint)
-    state_err = state_error(state + calibration.state_offset, labels["joint_state"].double(), revolute)
     points = labels["points"]
-    undefined = torch.full_like(state_err, torch.nan)
-    legacy_pivot = legacy_pivot_error(pivot, target_axis, target_pivot, points.double().mean(1))
-
     reconstruction = transform_points(prediction.part_pose, prediction.part_shape).flatten(1, 2).to(points.dtype)
     return {
         "r_err_deg": rotation.rad2deg(),
         "t_err": translation,
         "flip_rate": (rotation.rad2deg() > FLIP_DEG).double(),
-        "axis_err_deg": axis_angle_error(axis, target_axis).rad2deg(),
-        "pivot_err": torch.where(revolute, line_to_line_distance(axis, pivot, target_axis, target_pivot), undefined),
-        "state_err": torch.where(revolute, state_err.rad2deg(), state_err),
         "seg_miou": iou.gather(1, slot[:, None]).squeeze(1),
         "chamfer_l1": chamfer_l1(points, reconstruction).double(),
         "legacy_r_err_deg": legacy_fold(legacy_rotation).rad2deg(),
         "legacy_t_err": legacy_translation,
-        "legacy_axis_err_deg": legacy_axis_error(axis, target_axis).rad2deg(),
-        "legacy_pivot_err": torch.where(revolute, legacy_pivot, undefined),
         "legacy_seg_miou": iou.gather(1, legacy_slot[:, None]).squeeze(1),
         "legacy_chamfer_l1": legacy_chamfer(points, reconstruction).double(),
+        **joint_errors(prediction, labels, calibration),
     }
 
 

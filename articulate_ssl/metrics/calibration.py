@@ -132,6 +132,11 @@ def dense_prediction(prediction: Prediction, labels: dict[str, Tensor]) -> Tenso
     return prediction.part_id.long().gather(1, nearest)
 
 
+def predicts_joints(prediction: Prediction) -> bool:
+    """Whether the method says anything about joints; a rigid category has none, and part registration finds none."""
+    return prediction.joint_state.shape[1] > 0
+
+
 def match_joints(
     prediction: Prediction,
     part_of_slot: Tensor,  # [K]
@@ -265,9 +270,10 @@ def check_labels(prediction: Prediction, labels: dict[str, Tensor]) -> None:
         "points": (*prediction.part_id.shape, 3),
         "part_pose": (clouds, parts, 4, 4),
         "part_center": (clouds, parts, 3),
-        "joint_axis": (*prediction.joint_state.shape, 3),
         "dense_part_id": tuple(labels["dense_points"].shape[:2]),
     }
+    if predicts_joints(prediction):
+        expected["joint_axis"] = (*prediction.joint_state.shape, 3)
     for name, shape in expected.items():
         if tuple(labels[name].shape) != shape:
             raise ValueError(f"labels[{name!r}] is {tuple(labels[name].shape)}, the prediction asks for {shape}")
