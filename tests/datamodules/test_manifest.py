@@ -1,0 +1,72 @@
+"""The manifest: strict, atomic, byte-stable."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import pytest
+
+from datamodules.manifest import MANIFEST_NAME, Manifest, ManifestError, set_folder
+
+
+def edit(folder, **changes) -> None:
+    path = folder / MANIFEST_NAME
+    content = json.loads(path.read_text()) | changes
+    path.write_text(json.dumps({name: value for name, value in content.items() if value != "remove"}))
+
+
+def test_saving_what_was_loaded_gives_the_same_bytes(synthetic_set, tmp_path):
+    manifest = Manifest.load(synthetic_set)
+    manifest.save(tmp_path)
+    assert (tmp_path / MANIFEST_NAME).read_bytes() == (synthetic_set / MANIFEST_NAME).read_bytes()
+    assert Manifest.load(tmp_path) == manifest
+    assert (manifest.num_parts, manifest.num_samples("train"), manifest.num_samples("test")) == (2, 12, 16)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"schema_version": 99}, "schema version is 99, this program reads version 1"),
+        ({"schema_version": "remove"}, "schema version is None"),
+        ({"seed": "remove"}, "missing fields: seed"),
+        ({"mood": 1}, "unknown fields: mood"),
+        ({"view": "inside"}, "view is 'inside'"),
+        ({"protocol": "honest"}, "protocol is 'honest'"),
+        ({"instances": {"train": ["a"]}}, "names the splits"),
+        ({"instances": {"train": ["a"], "test": ["a"]}}, "twice"),
+        ({"rest_state": {}}, "rest_state"),
+        ({"joint_types": [0, 0]}, "2 entries"),
+        ({"shards": {"train": [{"name": "../a", "samples": 1, "sha256": ""}], "test": []}}, "plain file names"),
+        ({"shards": {"train": [{"name": "a"}], "test": []}}, "damaged"),
+        ({"shards": 3}, "damaged"),
+    ],
+)
+def test_an_unsound_manifest_is_refused(synthetic_set, changes, message):
+    edit(synthetic_set, **changes)
+    with pytest.raises(ManifestError, match=f"manifest.json: .*{message}"):
+        Manifest.load(synthetic_set)
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"schema_version": NaN}'])
+def test_what_is_no_manifest_is_refused(synthetic_set, content):
+    (synthetic_set / MANIFEST_NAME).write_text(content)
+    with pytest.raises(ManifestError, match=r"manifest.json: .*make data"):
+        Manifest.load(synthetic_set)
+
+
+def test_a_missing_manifest_is_named(tmp_path):
+    with pytest.raises(ManifestError, match=r"manifest.json: manifest is missing.*make data"):
+        Manifest.load(tmp_path)
+
+
+def test_splits_that_share_an_instance_cannot_be_described(synthetic_set):
+    manifest = Manifest.load(synthetic_set)
+    shared = {"train": manifest.instances["train"], "test": manifest.instances["train"][:1]}
+    with pytest.raises(ValueError, match="twice"):
+        dataclasses.replace(manifest, instances=shared)
+
+
+def test_folder_names():
+    assert str(set_folder("data", "oven")) == "data/oven/procedural-complete"
+    assert str(set_folder("data", "oven", "urdf", "partial", "eap")) == "data/oven/urdf-partial-eap"
