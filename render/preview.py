@@ -57,6 +57,6 @@ def _creases(
     depth: np.ndarray,  # [H, W], 0 where nothing is seen
     distance: float,
 ) -> np.ndarray:  # [H, W] in [0, 1]
-    """Drawn outlines: inverse depth is linear in the image across a plane, so its Laplacian shows edges and steps only."""
+    """Edges and steps: inverse depth is linear in the image across a plane, so its Laplacian is zero elsewhere."""
     inverse = np.divide(distance, depth, out=np.zeros_like(depth), where=depth > 0)
     return np.clip(np.abs(laplace(inverse)) / _CREASE_STEP, 0.0, 1.0)

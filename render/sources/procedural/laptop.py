@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from manifold3d import Manifold
 
-from datamodules.geometry import REVOLUTE
-from render.sources.procedural.design import Design, JointDesign
+from render.sources.procedural.design import Design, hinge
 from render.sources.procedural.shapes import box, cylinder, extrude, polygon, rounded_box, subtract, union
 
 
@@ -38,6 +37,7 @@ class LaptopParameters:
     foot_height: float
 
 
+_LARGEST_OPENING_DEG = 100.0  # beyond, the lid's rear edge would meet the base
 _TAPER_START = -0.3  # where the underside starts to rise, in depths from the middle
 
 
@@ -122,7 +122,7 @@ def build(p: LaptopParameters) -> Design:
     barrels = _barrel_ranges(p)
     return Design(
         parts={"base": _base(p, pivot, barrels), "lid": _lid(p, pivot, barrels, top + gap)},
-        joints=(JointDesign("lid_hinge", REVOLUTE, "base", "lid", axis=(-1.0, 0.0, 0.0), pivot=tuple(pivot)),),
+        joints=(hinge("lid_hinge", 1, (-1.0, 0.0, 0.0), pivot, upper_deg=_LARGEST_OPENING_DEG),),
     )
 
 
