@@ -7,10 +7,12 @@ Convention:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
 from math import radians
+from typing import Any
 
 import yaml
 
@@ -27,7 +29,7 @@ class JointSpec:
         type: `REVOLUTE` or `PRISMATIC`.
         parent: Index of the part nearer to the base.
         child: Index of the part that this joint moves.
-        lower: Smallest sampled coordinate: radians, or for prismatic joints a share of the joint's own travel in [0, 1].
+        lower: Smallest sampled coordinate: radians, or for prismatic joints a share of its own travel in [0, 1].
         upper: End of the sampled range (exclusive), in the unit of `lower`.
         rest: Coordinate of the canonical rest state, in the unit of `lower`.
     """
@@ -63,6 +65,27 @@ class ViewSpec:
 
 
 @dataclass(frozen=True)
+class RecognitionSpec:
+    """How sources that read data sets recognise the category in a foreign object (`render.sources.part_matching`).
+
+    Attributes:
+        zero: `smallest` or `largest`: the bounding box at joint coordinate 0, compared with the end of the motion.
+        front: `opening` if the front is the side to which the parts move, `opposite` if it is the other side.
+        order: Direction in the object frame along which joints that look the same are numbered.
+        sources: Options by source name: folder names, labels of the parts, and the like.
+    """
+
+    zero: str
+    front: str
+    order: tuple[float, float, float]
+    sources: Mapping[str, Mapping[str, Any]]
+
+    def rules(self, source: str) -> Mapping[str, Any]:
+        """Options of one source; none if the category states none."""
+        return self.sources.get(source, {})
+
+
+@dataclass(frozen=True)
 class CategorySpec:
     """A category.
 
@@ -74,6 +97,8 @@ class CategorySpec:
         test_instances: Default number of test instances.
         view: Range of partial views.
         min_visible_points: Fewest points of a stored partial cloud that every part must have.
+        recognition: How to find the category's parts in foreign objects; None for `articulated`, whose `parts` and
+            `joints` are empty because it takes every object as it is.
     """
 
     name: str
@@ -83,6 +108,19 @@ class CategorySpec:
     test_instances: int
     view: ViewSpec
     min_visible_points: int
+    recognition: RecognitionSpec | None = None
+
+    def of(self, instance: ArticulatedObject) -> CategorySpec:
+        """The specification itself; for `articulated`, one with the parts of the instance and its joints' limits."""
+        if self.parts:
+            return self
+        joints = tuple(
+            JointSpec(j.name, j.type, j.parent, j.child, j.lower, j.upper, j.rest)
+            if j.type == REVOLUTE
+            else JointSpec(j.name, j.type, j.parent, j.child, 0, 1, (j.rest - j.lower) / (j.upper - j.lower))
+            for j in instance.joints
+        )
+        return replace(self, parts=instance.part_names, joints=joints)
 
     def sampled_ranges(self, instance: ArticulatedObject) -> list[tuple[float, float]]:
         """Range of states to sample for every joint of an instance: the category's range within the joint's limits.
@@ -91,7 +129,7 @@ class CategorySpec:
             ValueError: if a joint's limits exclude the whole range.
         """
         ranges = []
-        for spec, joint in zip(self.joints, instance.joints, strict=True):
+        for spec, joint in zip(self.of(instance).joints, instance.joints, strict=True):
             lower, upper = (spec.coordinate(value, joint) for value in (spec.lower, spec.upper))
             clipped = max(lower, joint.lower), min(upper, joint.upper)
             if clipped[0] > clipped[1]:
@@ -108,14 +146,15 @@ class CategorySpec:
         Raises:
             ValueError: if its parts or joints are not those of the category.
         """
-        expected = [(s.type, s.parent, s.child) for s in self.joints]
-        if instance.part_names != self.parts or [(j.type, j.parent, j.child) for j in instance.joints] != expected:
+        own = self.of(instance)
+        expected = [(s.type, s.parent, s.child) for s in own.joints]
+        if instance.part_names != own.parts or [(j.type, j.parent, j.child) for j in instance.joints] != expected:
             raise ValueError(
                 f"{self.name} instance {instance.name!r} has parts {instance.part_names} and joints "
                 f"{[j.name for j in instance.joints]}; the category has parts {self.parts} and joints "
                 f"{[s.name for s in self.joints]}, with given types, parents and children"
             )
-        pairs = zip(self.joints, instance.joints, strict=True)
+        pairs = zip(own.joints, instance.joints, strict=True)
         return instance.at_rest([spec.coordinate(spec.rest, joint) for spec, joint in pairs])
 
 
@@ -151,6 +190,7 @@ def load_category(name: str) -> CategorySpec:
             resolution=view["resolution"],
         ),
         min_visible_points=content["min_visible_points"],
+        recognition=RecognitionSpec(**content["recognition"]) if content["joints"] else None,
     )
 
 
