@@ -1,0 +1,1 @@
+"""What a user does with a trained model: read a scan, predict, write the results, draw them."""
