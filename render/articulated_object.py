@@ -130,9 +130,7 @@ class ArticulatedObject:
             if joint.type not in (REVOLUTE, PRISMATIC):
                 fail(f"joint {joint.name!r} has unknown type {joint.type}")
             if not (0 <= joint.parent < self.num_parts and 0 <= joint.child < self.num_parts):
-                fail(
-                    f"joint {joint.name!r} connects parts {joint.parent} and {joint.child}, outside 0..{self.num_parts - 1}"
-                )
+                fail(f"joint {joint.name!r} connects parts {joint.parent} and {joint.child} of {self.num_parts}")
             values = (*joint.axis, *joint.pivot, joint.lower, joint.upper, joint.rest)
             if not np.isfinite(values).all():
                 fail(f"joint {joint.name!r} has NaN or infinite axis, pivot or limits")
@@ -142,7 +140,7 @@ class ArticulatedObject:
                 fail(f"joint {joint.name!r} has reversed limits [{joint.lower}, {joint.upper}]")
         if sorted(children) != [k for k in range(self.num_parts) if k != self.base]:
             fail(
-                f"every part except the base ({self.base}) must be the child of one joint; children are {sorted(children)}"
+                f"every part but the base ({self.base}) must be the child of one joint; children are {sorted(children)}"
             )
         try:
             self.part_motion(np.array([j.rest for j in self.joints]))

@@ -95,7 +95,8 @@ def move_parts(
     moved = np.empty_like(points)
     for part, matrix in enumerate(motion):
         mine = part_id == part
-        moved[mine] = points[mine] @ matrix[:3, :3].T + matrix[:3, 3]
+        # einsum, not a matrix product: BLAS may round differently with the number of threads.
+        moved[mine] = np.einsum("ab,nb->na", matrix[:3, :3], points[mine]) + matrix[:3, 3]
     return moved
 
 

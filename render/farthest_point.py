@@ -14,7 +14,8 @@ def farthest_point_order(
 ) -> np.ndarray:  # [num_points]
     """Indices such that every next point is a farthest one from those before it: each prefix is an even sample.
 
-    Exact farthest-point sampling by a bucketed kd-tree (Han et al. 2023, QuickFPS); the start point is arbitrary but fixed.
+    Exact farthest-point sampling with a bucketed kd-tree (QuickFPS, Han et al. 2023). The start point is arbitrary but
+    a function of the points.
 
     Raises:
         ValueError: if there are fewer than `num_points` points.

@@ -22,7 +22,9 @@ from datamodules.atomic import remove_leftovers
 from datamodules.manifest import PROTOCOLS, SPLITS, VIEWS, Manifest, ManifestError, ShardEntry, set_folder
 from datamodules.shards import sha256_of
 from render.category import CategorySpec, category_names, load_category
+from render.depth_renderer import DepthRenderer, RendererUnavailable
 from render.execution import run_tasks
+from render.partial_cloud import RENDERERS
 from render.shard_task import SetOptions, ShardResult, ShardTask, plan_shards
 from render.sources import SOURCES, open_source
 
@@ -70,8 +72,8 @@ def split_instances(options: SetOptions, spec: CategorySpec) -> dict[str, tuple[
     train, test = options.train_instances, options.test_instances
     if train + test > len(ids):
         raise ValueError(
-            f"source {options.source!r} has {len(ids)} instances of {options.category}, too few for {train} training and "
-            f"{test} test instances; pass smaller --train-instances and --test-instances"
+            f"source {options.source!r} has {len(ids)} instances of {options.category}, too few for {train} "
+            f"training and {test} test instances; pass smaller --train-instances and --test-instances"
         )
     return {"train": tuple(ids[:train]), "test": tuple(ids[train : train + test])}
 
@@ -147,8 +149,8 @@ def _repair(folder: Path, options: SetOptions, tasks: list[ShardTask], workers: 
     for result in _with_progress(run_tasks(broken, workers, scheduler), len(broken), options):
         if result.sha256 != entries[result.split, result.name].sha256:
             raise ValueError(
-                f"{folder / result.split / result.name}: made again, but its bytes differ from those in the manifest: the "
-                f"set came from other software or source files; delete {folder} and make it anew"
+                f"{folder / result.split / result.name}: made again, but its bytes differ from those in the "
+                f"manifest: the set came from other software or source files; delete {folder} and make it anew"
             )
 
 
@@ -209,6 +211,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--views", type=_at_least(1), default=10, help="depth views of each articulation state")
     add("--resolution", type=_at_least(16), help="of depth images, pixels; default: as in the category's specification")
     add("--points", type=_at_least(1), default=4096, help="points per cloud")
+    add("--renderer", choices=("auto", *RENDERERS), default="auto", help="of partial views; auto: egl if it works")
     add("--noise-std", type=float, default=0.0, help="of depth, in rest-state bounding-box diagonals")
     return parser
 
@@ -250,7 +253,27 @@ def options_from(arguments: argparse.Namespace) -> SetOptions:
         resolution=arguments.resolution or spec.view.resolution,
         points=arguments.points,
         noise_std=arguments.noise_std,
+        renderer=choose_renderer(arguments.renderer) if arguments.view == "partial" else None,
     )
+
+
+def choose_renderer(wanted: str) -> str:
+    """Name of the renderer to use; says so on stderr if `auto` has to do without EGL.
+
+    Raises:
+        ValueError: if `egl` is wanted and does not work.
+    """
+    if wanted == "ray-caster":
+        return wanted
+    try:
+        DepthRenderer([])
+    except RendererUnavailable as error:
+        remedy = "install libegl1 and libgl1"
+        if wanted == "egl":
+            raise ValueError(f"{error}; {remedy}, or use --renderer ray-caster") from error
+        print(f"{error}; using the slower ray caster instead. For speed {remedy}.", file=sys.stderr)
+        return "ray-caster"
+    return "egl"
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""Which articulation states and global rotations of an instance become samples, and the labels that follow from them."""
+"""Which articulation states and global rotations of an instance become samples, and the labels that follow."""
 
 from __future__ import annotations
 
@@ -25,19 +25,31 @@ def sample_rotation(rng: np.random.Generator) -> np.ndarray:  # [3, 3]
     return Rotation.random(rng=rng).as_matrix()
 
 
+def compose(
+    rotation: np.ndarray,  # [3, 3]
+    translation: np.ndarray,  # [3]
+    motion: np.ndarray,  # [K, 4, 4]
+) -> np.ndarray:  # [K, 4, 4]
+    """Poses of parts that move in the object frame, then with the whole object."""
+    pose = motion.copy()
+    # einsum, not a matrix product: BLAS may round differently with the number of threads.
+    pose[:, :3] = np.einsum("ab,kbc->kac", rotation, motion[:, :3])
+    pose[:, :3, 3] += translation
+    return pose
+
+
 def pose_labels(
     instance: ArticulatedObject,
     states: np.ndarray,  # [J]
+    motion: np.ndarray,  # [K, 4, 4], `instance.part_motion(states)`
     rotation: np.ndarray,  # [3, 3]
     translation: np.ndarray,  # [3], so that camera = rotation @ object + translation
     center: np.ndarray,  # [3], camera frame
     scale: float,
 ) -> dict[str, np.ndarray]:
     """The pose and joint arrays of one sample of a shard, named and defined as in `datamodules.shards` (float64)."""
-    motion = instance.part_motion(states)  # [K, 4, 4]
-    pose = motion.copy()
-    pose[:, :3, :3] = rotation @ motion[:, :3, :3]
-    pose[:, :3, 3] = (motion[:, :3, 3] @ rotation.T + translation - center) / scale
+    pose = compose(rotation, translation - center, motion)
+    pose[:, :3, 3] /= scale
     parent = [joint.parent for joint in instance.joints]
     axis = np.array([joint.axis for joint in instance.joints]).reshape(-1, 3)
     pivot = np.array([joint.pivot for joint in instance.joints]).reshape(-1, 3) / scale

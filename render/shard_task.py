@@ -13,6 +13,7 @@ from datamodules.shards import SHARD_ARRAYS, write_shard
 from render.articulated_object import ArticulatedObject
 from render.category import load_category
 from render.complete_cloud import ReachableSurface
+from render.partial_cloud import DepthSensor
 from render.posing import pose_labels, sample_rotation, sample_states
 from render.seeds import generator_for
 from render.sources import open_source
@@ -40,6 +41,7 @@ class SetOptions:
         resolution: Width and height of the depth images, pixels.
         points: Points per cloud.
         noise_std: Standard deviation of the depth noise, in units of the rest-state bounding-box diagonal.
+        renderer: One of `render.partial_cloud.RENDERERS` for partial views, None for complete clouds.
     """
 
     category: str
@@ -56,6 +58,7 @@ class SetOptions:
     resolution: int
     points: int
     noise_std: float
+    renderer: str | None
 
     def copies(self, split: str) -> int:
         """Stored samples per articulation state."""
@@ -136,9 +139,10 @@ def make_shard(task: ShardTask) -> ShardResult:
     instance = _load_instance(options.category, options.source, options.root, options.seed, task.instance_id)
     ranges = spec.sampled_ranges(instance)
     all_states = sample_states(ranges, options.states, _generator(task, "states"))
+    make_samples = _partial_samples if options.view == "partial" else _complete_samples
     samples = []
     for state in range(task.first_state, task.last_state):
-        samples += _complete_samples(task, instance, all_states[state], state)
+        samples += make_samples(task, instance, all_states[state], state)
     arrays = _stack(samples, instance, task.instance_index)
     path = Path(task.folder) / task.split / task.name
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -153,7 +157,7 @@ def make_shard(task: ShardTask) -> ShardResult:
         instance_id=task.instance_id,
         rest_state=tuple(rest.tolist()),
         articulation_range=tuple(map(tuple, ((np.array(ranges) - rest[:, None]) / unit[:, None]).tolist())),
-        rejected_views=0,
+        rejected_views=sum(sample.pop("rejected_views", 0) for sample in samples),
     )
 
 
@@ -166,15 +170,31 @@ def _complete_samples(
 ) -> list[dict[str, np.ndarray]]:
     """One cloud of the articulation state, in one stored orientation (train) or in several (test)."""
     options = task.options
-    surface = _reachable_surface(task.split, instance, options.seed, options.points)
-    cloud, part_id = surface.cloud(instance.part_motion(states), options.points, _generator(task, "cloud", index))
+    surface = _reachable_surface(options, task.split, task.instance_id)
+    motion = instance.part_motion(states)
+    cloud, part_id = surface.cloud(motion, options.points, _generator(task, "cloud", index))
     samples = []
     for copy in range(options.copies(task.split)):
         rotation = np.eye(3) if task.split == "train" else sample_rotation(_generator(task, "rotation", index, copy))
         rotated = np.einsum("nb,ab->na", cloud, rotation)
         center, scale = rotated.mean(0), instance.rest_diagonal
-        labels = pose_labels(instance, states, rotation, np.zeros(3), center, scale)
+        labels = pose_labels(instance, states, motion, rotation, np.zeros(3), center, scale)
         samples.append({"points": (rotated - center) / scale, "part_id": part_id, **labels})
+    return samples
+
+
+def _partial_samples(
+    task: ShardTask, instance: ArticulatedObject, states: np.ndarray, index: int
+) -> list[dict[str, np.ndarray]]:
+    """Several views of the articulation state."""
+    sensor = _depth_sensor(task.options, task.instance_id)
+    motion = instance.part_motion(states)
+    samples = []
+    for view in range(task.options.views):
+        seen = sensor.observe(motion, _generator(task, "view", index, view))
+        labels = pose_labels(instance, states, motion, seen.rotation, seen.translation, seen.center, seen.scale)
+        points = (seen.points - seen.center) / seen.scale
+        samples.append({"points": points, "part_id": seen.part_id, "rejected_views": seen.rejected_views, **labels})
     return samples
 
 
@@ -193,7 +213,7 @@ def _stack(samples: list[dict[str, np.ndarray]], instance: ArticulatedObject, in
     return arrays
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=1)
 def _load_instance(category: str, source: str, root: str | None, seed: int, instance_id: str) -> ArticulatedObject:
     """The validated instance in its category's rest state; kept for the next shard of the same instance."""
     spec = load_category(category)
@@ -201,17 +221,26 @@ def _load_instance(category: str, source: str, root: str | None, seed: int, inst
     return spec.to_rest(instance.validate())
 
 
-_surfaces: dict[tuple, ReachableSurface] = {}
-
-
-def _reachable_surface(split: str, instance: ArticulatedObject, seed: int, num_points: int) -> ReachableSurface:
+@lru_cache(maxsize=1)
+def _reachable_surface(options: SetOptions, split: str, instance_id: str) -> ReachableSurface:
     """The instance's pool of reachable points; kept for the next shard of the same instance."""
-    key = (split, instance.category, instance.name, seed, num_points)
-    if key not in _surfaces:
-        _surfaces.clear()
-        lower, upper = np.array(load_category(instance.category).sampled_ranges(instance)).T
-        states = np.linspace(lower, upper, _REACH_STATES)
-        _surfaces[key] = ReachableSurface(
-            instance, states, generator_for(seed, split, instance.name, "surface"), num_points
-        )
-    return _surfaces[key]
+    instance = _load_instance(options.category, options.source, options.root, options.seed, instance_id)
+    lower, upper = np.array(load_category(options.category).sampled_ranges(instance)).T
+    states = np.linspace(lower, upper, _REACH_STATES)
+    return ReachableSurface(instance, states, generator_for(options.seed, split, instance_id, "surface"))
+
+
+@lru_cache(maxsize=1)
+def _depth_sensor(options: SetOptions, instance_id: str) -> DepthSensor:
+    """The sensor that looks at the instance; kept for the next shard of the same instance."""
+    spec = load_category(options.category)
+    return DepthSensor(
+        _load_instance(options.category, options.source, options.root, options.seed, instance_id),
+        spec.view,
+        renderer=options.renderer,
+        protocol=options.protocol,
+        resolution=options.resolution,
+        num_points=options.points,
+        min_visible_points=spec.min_visible_points,
+        noise_std=options.noise_std,
+    )
