@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf, pi
 from pathlib import Path
@@ -111,6 +111,15 @@ class LinkGraph:
         joints = tuple(replace(j, axis=rotation @ j.axis, pivot=rotation @ j.pivot) for j in self.joints)
         return replace(self, links=links, joints=joints)
 
+    def labelled(self, labels: Mapping[str, str]) -> LinkGraph:
+        """The graph with the labels of links given by name; a link without one takes that of its only child."""
+
+        def label(link: str) -> str:
+            below = [joint.child for joint in self.joints if joint.parent == link]
+            return labels.get(link) or (label(below[0]) if len(below) == 1 else "")
+
+        return replace(self, joints=tuple(replace(joint, label=label(joint.child)) for joint in self.joints))
+
 
 def tree_order(links: Sequence[str], joints: Sequence, file: Path) -> list[str]:
     """Link names, each after its parent. Joints need `name`, `parent` and `child` only.
@@ -181,8 +190,11 @@ def merge_links(
         pieces[part_of[link]].append(meshes[link])
     merged = tuple(concatenate(part) for part in pieces)
     for name, mesh in zip(part_names, merged, strict=True):
+        mesh.remove_unreferenced_vertices()
         if len(mesh.faces) == 0:
             raise ValueError(f"{graph.file}: part {name!r} is empty, none of its links has a mesh")
+        if mesh.area <= 0:
+            raise ValueError(f"{graph.file}: part {name!r} has no surface area, its mesh or mesh scale is degenerate")
     joints = tuple(_merged_joint(joint, part_of, graph.file) for joint in modelled)
     return ArticulatedObject(instance_id, category, tuple(part_names), merged, joints)
 

@@ -65,6 +65,22 @@ def to_category(
     return build(graph, modelled).validate()
 
 
+def require_rules(spec: CategorySpec, source: str) -> None:
+    """Raise ValueError if a category with parts of its own does not say how to find them in a source."""
+    if spec.parts and source not in spec.recognition.sources:
+        known = ", ".join(spec.recognition.sources)
+        raise ValueError(f"source {source!r} has no objects of category {spec.name!r}; it can be read from {known}")
+
+
+def joint_groups(spec: CategorySpec, source: str) -> dict[tuple[int, str], list[int]]:
+    """Indices of the joints that a source cannot tell apart, by joint type and label pattern of the moved part."""
+    groups: dict[tuple[int, str], list[int]] = {}
+    for index, joint in enumerate(spec.joints):
+        pattern = spec.recognition.rules(source).get("labels", {}).get(spec.parts[joint.child], "")
+        groups.setdefault((joint.type, pattern), []).append(index)
+    return groups
+
+
 def match_joints(graph: LinkGraph, spec: CategorySpec, source: str) -> list[LinkJoint]:
     """The joints of the graph that are the category's, in its order.
 
@@ -77,19 +93,16 @@ def match_joints(graph: LinkGraph, spec: CategorySpec, source: str) -> list[Link
         ValueError: naming the file and its joints, if the numbers do not agree.
     """
     rules = spec.recognition.rules(source)
-    groups: dict[tuple[int, str], list[int]] = {}
-    for index, joint in enumerate(spec.joints):
-        pattern = rules.get("labels", {}).get(spec.parts[joint.child], "")
-        groups.setdefault((joint.type, pattern), []).append(index)
     matched: dict[int, LinkJoint] = {}
-    for (joint_type, pattern), indices in groups.items():
+    for (joint_type, pattern), indices in joint_groups(spec, source).items():
         candidates = [joint for joint in graph.movable() if joint.type == joint_type]
         if rules.get("labels_required") or len(candidates) > len(indices):
             candidates = [joint for joint in candidates if re.search(pattern, joint.label, re.IGNORECASE)]
         if rules.get("first"):
             candidates = candidates[: len(indices)]
         if len(candidates) != len(indices):
-            wanted = f"{len(indices)} {_TYPE_NAMES[joint_type]} joint(s)" + (f" labelled {pattern!r}" if pattern else "")
+            wanted = f"{len(indices)} {_TYPE_NAMES[joint_type]} joint(s)"
+            wanted += f" labelled {pattern!r}" if pattern else ""
             found = ", ".join(f"{_TYPE_NAMES[j.type]} {j.name!r} ({j.label})" for j in graph.movable()) or "none"
             raise ValueError(
                 f"{graph.file}: no matching parts for category {spec.name!r}: it needs {wanted}, the object has {found}"

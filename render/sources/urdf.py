@@ -22,7 +22,7 @@ from datamodules.geometry import PRISMATIC, REVOLUTE
 from render.articulated_object import ArticulatedObject
 from render.sources.link_graph import FIXED, Link, LinkGraph, LinkJoint, tree_order
 from render.sources.mesh_loading import concatenate, load_mesh, parse_xml, resolve_inside, transformed
-from render.sources.part_matching import to_category
+from render.sources.part_matching import require_rules, to_category
 
 if TYPE_CHECKING:
     from render.category import CategorySpec
@@ -70,6 +70,7 @@ def open(spec: CategorySpec, root: Path | None, seed: int) -> UrdfSource:
     Raises:
         ValueError: if there are none.
     """
+    require_rules(spec, "urdf")
     if root is None:
         raise ValueError("source 'urdf' needs a root: a folder that holds URDF files, or one such file")
     root = Path(root)
@@ -81,7 +82,7 @@ def open(spec: CategorySpec, root: Path | None, seed: int) -> UrdfSource:
     return UrdfSource(spec, root, files)
 
 
-def read_urdf(file: Path, root: Path) -> LinkGraph:
+def read_urdf(file: Path, root: Path, below_root: bool = False) -> LinkGraph:
     """Links and joints of a URDF in the frame of its root link, at the zero configuration.
 
     Visual geometry only. A `<limit>` needs no effort and velocity, axes need no unit length, zero may lie outside the
@@ -91,6 +92,7 @@ def read_urdf(file: Path, root: Path) -> LinkGraph:
     Args:
         file: The URDF.
         root: Folder that no mesh path may leave.
+        below_root: State the graph in the frame of the first link below the root instead of the root's own.
 
     Raises:
         ValueError: naming the file, if it is malformed, describes no tree, has a mimic, planar or floating joint, or
@@ -98,6 +100,9 @@ def read_urdf(file: Path, root: Path) -> LinkGraph:
     """
     robot = _parse(file)
     poses = _link_poses(robot, file)
+    if below_root and robot.joints:
+        first = next(joint.child for joint in robot.joints if joint.parent == next(iter(poses)))
+        poses = {name: np.linalg.solve(poses[first], pose) for name, pose in poses.items()}
     links = tuple(
         Link(link.name, concatenate([_surface(v, poses[link.name], file, root) for v in link.visuals]))
         for link in robot.links
@@ -157,6 +162,8 @@ def _check_numbers(xml: ElementTree.Element, file: Path) -> None:
                 values = [float(value) for value in text.split()]
             except ValueError as error:
                 raise ValueError(f"{file}: <{element.tag} {attribute}={text!r}> is malformed ({error})") from error
+            if np.isnan(values).any() or (element.tag != "limit" and np.isinf(values).any()):
+                raise ValueError(f"{file}: <{element.tag} {attribute}={text!r}> is NaN or infinite")
             if len(values) not in counts:
                 raise ValueError(
                     f"{file}: <{element.tag} {attribute}={text!r}> has {len(values)} numbers, not {counts[0]}"
