@@ -12,14 +12,16 @@ import numpy as np
 
 from render.articulated_object import ArticulatedObject
 from render.category import CategorySpec
-from render.sources.procedural import drawer, laptop, oven, washing_machine
+from render.sources.procedural import drawer, eyeglasses, laptop, oven, safe, washing_machine
 from render.sources.procedural.shapes import to_trimesh
 
 GENERATORS = {
     "drawer": lambda rng: drawer.build(drawer.sample(rng)),
+    "eyeglasses": lambda rng: eyeglasses.build(eyeglasses.sample(rng)),
     "laptop": lambda rng: laptop.build(laptop.sample_laptop(rng)),
     "laptop_real": lambda rng: laptop.build(laptop.sample_laptop_real(rng)),
     "oven": lambda rng: oven.build(oven.sample(rng)),
+    "safe": lambda rng: safe.build(safe.sample(rng)),
     "washing_machine": lambda rng: washing_machine.build(washing_machine.sample(rng)),
 }
 NUM_INSTANCES = 10_000  # that have an id; they are made when they are loaded

@@ -48,7 +48,7 @@ def sample(rng: np.random.Generator) -> DrawerParameters:
     width = rng.uniform(0.34, 0.95)
     depth = rng.uniform(0.36, 0.56)
     base_height = rng.uniform(0.12, 0.24)
-    growth = rng.choice([0.0, 0.0, 0.04, 0.12])  # lower drawers may be deeper
+    growth = rng.choice([0.0, 0.0, 0.03, 0.07])  # lower drawers may be deeper
     handle = str(rng.choice(["bar", "flat_bar", "knob", "cup", "cut_out"]))
     stand = str(rng.choice(["none", "plinth", "round_feet", "square_feet"], p=[0.15, 0.3, 0.3, 0.25]))
     return DrawerParameters(
@@ -146,7 +146,7 @@ def _with_handles(p: DrawerParameters, solid: Manifold, y: float, top: float) ->
         tool = rounded_box((-half, top - reach, d - 2 * p.front_thickness), (half, top + reach, d + 0.01), "z", 0.02)
         return solid - tool
     xs = (-0.24 * p.width, 0.24 * p.width) if p.two_handles else (0.0,)
-    length = min(p.handle_length, 0.4 * p.width)
+    length = min(p.handle_length, (0.3 if p.two_handles else 0.5) * p.width)
     return union([solid, *(_handle(p, (x, y, d), length) for x in xs)])
 
 

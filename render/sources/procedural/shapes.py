@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import trimesh
-from manifold3d import CrossSection, Manifold, OpType
+from manifold3d import CrossSection, Manifold, Mesh64, OpType
 
 SEGMENTS = 24  # edges of a full circle
 
@@ -87,6 +87,20 @@ def cylinder(
 def revolve(profile: Sequence[Sequence[float]], axis: str, segments: int = SEGMENTS) -> Manifold:
     """Solid of revolution about a coordinate axis of the polygon in (radius, height along the axis)."""
     return _orient(polygon(profile).revolve(segments), axis)
+
+
+def loft(
+    rings: np.ndarray,  # [S, M, 3]
+) -> Manifold:
+    """Skin through S >= 2 convex rings of M points, with flat ends; rings wind counter-clockwise seen from the last."""
+    sections, count = rings.shape[:2]
+    u = np.arange(count)
+    v = np.roll(u, -1)
+    sides = [np.stack([u, v, v + count, u, v + count, u + count], axis=-1).reshape(-1, 3)]
+    bands = np.concatenate([sides[0] + count * i for i in range(sections - 1)])
+    fan = np.stack([np.zeros(count - 2, dtype=int), u[1:-1], v[1:-1]], axis=-1)
+    faces = np.concatenate([bands, fan[:, ::-1], fan + count * (sections - 1)])
+    return Manifold(Mesh64(rings.reshape(-1, 3), faces.astype(np.uint64)))
 
 
 def union(solids: Sequence[Manifold]) -> Manifold:
