@@ -123,12 +123,12 @@ class ArticulatedDataModule(LightningDataModule):
         options = self.hparams
         common = {"folder": self.folder, "num_points": options.num_points, "verify": options.verify}
         self.__dict__.pop("manifest", None)
-        if self.manifest.view == "complete" and stage in ("fit", "validate"):
-            common["rotate"] = True
         if stage in ("fit", "validate"):
             common |= {"noise_std": options.noise_std, "dense": options.dense_in_fit, "seed": options.seed}
+            common["rotate"] = self.manifest.view == "complete"
             self.train_set = ArticulatedDataset(split="train", **common)
-            self.consumed_samples = 0
+            if stage == "fit":
+                self.consumed_samples = 0
         elif stage == "test":
             self.test_set = ArticulatedDataset(split="test", noise_std=options.test_noise_std, **common)
 
@@ -155,6 +155,18 @@ class ArticulatedDataModule(LightningDataModule):
         instance = self.test_set.labels["instance"]
         subset = np.arange(len(instance)) if limit is None else spread_subset(instance, limit)
         return self._loader(self.test_set, EvaluationSampler(subset, *self._world()))
+
+    def calibration_dataloader(self, samples: int = 128) -> DataLoader:
+        """A fixed subset of the training clouds for calibrating metrics, in any stage and whole on every rank.
+
+        Clouds are without noise, under one fixed rotation each if complete, with the dense arrays.
+
+        Args:
+            samples: Size of the subset, spread evenly over instances and states.
+        """
+        options, rotate = self.hparams, self.manifest.view == "complete"
+        dataset = ArticulatedDataset(self.folder, "train", options.num_points, rotate, verify=options.verify)
+        return self._loader(dataset, EvaluationSampler(spread_subset(dataset.labels["instance"], samples)))
 
     def on_before_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
         """Count what training consumes here, where loaders cannot run ahead of it."""

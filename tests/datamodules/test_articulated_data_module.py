@@ -158,6 +158,15 @@ def test_a_limited_test_is_the_same_every_time(tmp_path, synthetic_set):
     assert [sum(i // 8 == instance for i in samples[0]) for instance in (0, 1)] == [3, 3]
 
 
+def test_calibration_clouds_are_fixed_rotated_dense_training_clouds(tmp_path, synthetic_set):
+    batches = [list(data(tmp_path, seed=s, noise_std=s).calibration_dataloader(6)) for s in (0, 1)]
+    assert_same_batches(*batches)
+    assert [len(batch["sample"]) for batch in batches[0]] == [4, 2]
+    assert batches[0][0]["dense_points"].shape == (4, 128, 3)
+    assert batches[0][0]["instance"].tolist() == [0, 0, 1, 1]
+    assert not torch.allclose(batches[0][0]["object_rotation"][0], torch.eye(3), atol=0.1)
+
+
 def test_partial_clouds_are_not_rotated(tmp_path):
     write_synthetic_set(tmp_path, view="partial", protocol="honest")
     module = data(tmp_path, view="partial", dense_in_fit=True)
