@@ -34,9 +34,8 @@ def chain_of_boxes(boxes, joints, states, num_points=512, shape_points=256, seed
     """
     shapes = torch.stack([box_points(e, (0, 0, 0), shape_points, seed + k) for k, (e, _) in enumerate(boxes)])
     assembly = torch.tensor([c for _, c in boxes], dtype=torch.float32)
-    axis = torch.tensor([j[3] for j in joints], dtype=torch.float32)
-    pivot = torch.tensor([j[4] for j in joints], dtype=torch.float32)
-    parent, child = torch.tensor([j[1] for j in joints]), torch.tensor([j[2] for j in joints])
+    axis, pivot = (torch.tensor([j[i] for j in joints], dtype=torch.float32).reshape(-1, 3) for i in (3, 4))
+    joint_type, parent, child = (torch.tensor([j[i] for j in joints], dtype=torch.int64) for i in range(3))
     base_pose = se3(random_rotation(seed), torch.tensor([0.05, -0.02, 0.03]))
     incomplete = dict(
         part_shape=shapes[None],
@@ -44,7 +43,7 @@ def chain_of_boxes(boxes, joints, states, num_points=512, shape_points=256, seed
         base_pose=base_pose[None],
         joint_parent=parent[None],
         joint_child=child[None],
-        joint_type=torch.tensor([[j[0] for j in joints]]),
+        joint_type=joint_type[None],
         joint_state=torch.tensor([states], dtype=torch.float32),
         canonical_axis=axis[None],
         canonical_pivot=pivot[None],
