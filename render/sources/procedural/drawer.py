@@ -127,7 +127,8 @@ def _drawer(p: DrawerParameters, low: float, high: float) -> Manifold:
     if p.inset_fronts:
         half, bottom, top = inner, low + _GAP, high - _GAP
     else:
-        half, bottom, top = w - 0.001, low - p.rail / 2 + _GAP / 2, high + p.rail / 2 - _GAP / 2
+        half, bottom = w - 0.001, low - p.rail / 2 + _GAP / 2
+        top = min(high + p.rail / 2 - _GAP / 2, _openings(p)[0][1] - _GAP)  # below the table top
     front = rounded_box((-half, bottom, d - p.front_thickness), (half, top, d), "z", 0.002, p.front_edge)
     box_top = low + p.box_height_share * (high - low)
     shell = box((-inner, low + _GAP, back), (inner, box_top, d - p.front_thickness + OVERLAP))

@@ -142,10 +142,15 @@ def _curved(p: EyeglassesParameters, x: float | np.ndarray) -> float | np.ndarra
 def _hinge_points(p: EyeglassesParameters, rim: CrossSection, center: float) -> tuple[np.ndarray, np.ndarray]:
     """Where the end piece leaves the right rim, and the hinge's pivot."""
     y = 0.5 * p.lens_height * p.hinge_height
-    strip = rim ^ CrossSection.square((1.0, 2e-3), center=True).translate((0.0, y))
-    x = center + strip.bounds()[2]
+    x = center + _horizontal_extent(rim, y)[1]
     attach = np.array([x, y, _curved(p, x)])
     return attach, attach + np.array([p.end_width, 0.0, -p.end_depth - 0.5 * p.rim_depth])
+
+
+def _horizontal_extent(rim: CrossSection, y: float) -> tuple[float, float]:
+    """Smallest and largest x of a rim at a height."""
+    bounds = (rim ^ CrossSection.square((1.0, 2e-3), center=True).translate((0.0, y))).bounds()
+    return bounds[0], bounds[2]
 
 
 def _front(p: EyeglassesParameters, outline: np.ndarray, rim: CrossSection, center: float) -> Manifold:
@@ -153,13 +158,13 @@ def _front(p: EyeglassesParameters, outline: np.ndarray, rim: CrossSection, cent
     half = 0.5 * p.rim_depth
     ring = extrude(rim - CrossSection([outline]), "z", -half, half)
     if not p.lower_rim:
-        ring = ring.trim_by_plane((0.0, 1.0, 0.0), -0.1 * p.lens_height)
+        ring = ring.trim_by_plane((0.0, 1.0, 0.0), -0.12 * p.lens_height)
     pieces = [ring]
     if p.lenses:
         glass = min(0.0018, 0.8 * p.rim_depth)
         pieces.append(extrude(CrossSection([outline]).offset(2e-4), "z", -glass / 2, glass / 2))
     if p.nose_pads:
-        pieces.append(_nose_pad(p))
+        pieces.append(_nose_pad(p, rim))
     side = union(pieces).translate((center, 0.0, 0.0))
     front = union([side, _mirrored(side), *_bridges(p, rim, center)])
     lengthy = front.refine_to_length(0.012)
@@ -176,8 +181,7 @@ def _bridges(p: EyeglassesParameters, rim: CrossSection, center: float) -> list[
         heights.append(0.46 * p.lens_height)
     bridges = []
     for y in heights:
-        strip = rim ^ CrossSection.square((1.0, 2e-3), center=True).translate((0.0, y))
-        reach = center + strip.bounds()[0] + 0.5 * p.rim_width
+        reach = center + _horizontal_extent(rim, y)[0] + 0.5 * p.rim_width
         x = np.linspace(-reach, reach, 9)
         arch = y + p.bridge_arch * (1 - np.square(x / reach))
         bridges.append(_rod(np.stack([x, arch, 0 * x], axis=-1), p.bridge_radius))
@@ -191,13 +195,14 @@ def _rod(path: np.ndarray, radius: float) -> Manifold:
     return loft(path[:, None] + ring)
 
 
-def _nose_pad(p: EyeglassesParameters) -> Manifold:
+def _nose_pad(p: EyeglassesParameters, rim: CrossSection) -> Manifold:
     """Pad and its arm, on the nose side of a lens that is centred at the origin."""
-    x, y = -0.5 * p.lens_width - 0.4 * p.rim_width, -0.12 * p.lens_height
+    y = -0.08 * p.lens_height
+    x = _horizontal_extent(rim, y)[0] + 0.5 * p.rim_width
     pad = Manifold.sphere(1.0, 12).scale((0.0014, 0.0062, 0.0036)).rotate((0.0, 28.0, -12.0))
-    pad = pad.translate((x - 0.0012, y - 0.002, -0.0085))
+    pad = pad.translate((x - 0.002, y - 0.002, -0.0085))
     arm = Manifold.batch_hull(
-        [Manifold.sphere(0.0009, 8).translate((x + dx, y, z)) for dx, z in ((0.0, 0.0), (-0.0012, -0.0085))]
+        [Manifold.sphere(0.0009, 8).translate((x + dx, y, z)) for dx, z in ((0.0, 0.0), (-0.002, -0.0085))]
     )
     return pad + arm
 

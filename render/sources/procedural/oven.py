@@ -90,22 +90,23 @@ def sample(rng: np.random.Generator) -> OvenParameters:
 def build(p: OvenParameters) -> Design:
     """Body and closed door. The hinge runs inside the lower edge of the door, which is rounded about it."""
     front = p.depth / 2
-    roll = 0.35 * p.door_thickness
+    roll = 0.2 * p.door_thickness
     gap = 0.002
     pivot = np.array([0.0, p.plinth_height + gap + roll, front + p.door_thickness - roll])
     return Design(
-        parts={"body": _body(p, front), "door": _door(p, front, pivot, roll, gap)},
+        parts={"body": _body(p, front, pivot[2] - roll - gap), "door": _door(p, front, pivot, roll, gap)},
         joints=(hinge("door_hinge", 1, (1.0, 0.0, 0.0), pivot, upper_deg=135.0),),
     )
 
 
-def _body(p: OvenParameters, front: float) -> Manifold:
+def _body(p: OvenParameters, front: float, plinth_front: float) -> Manifold:
+    """`plinth_front` leaves room for the door's lower edge, which turns over it."""
     w, t = p.width / 2, p.door_thickness
     door_top = p.plinth_height + p.door_height
     height = door_top + p.panel_height
     carcass = rounded_box((-w, 0, -front), (w, height, front), "z", p.corner)
     panel = rounded_box((-w, door_top, front - OVERLAP), (w, height, front + t), "z", p.corner, 0.003)
-    plinth = rounded_box((-w, 0, front - OVERLAP), (w, p.plinth_height, front + t), "z", min(p.corner, 0.01), 0.003)
+    plinth = rounded_box((-w, 0, front - OVERLAP), (w, p.plinth_height, plinth_front), "z", min(p.corner, 0.01), 0.003)
     cavity = rounded_box(
         (-w + p.wall, p.plinth_height + p.wall, -front + p.wall),
         (w - p.wall, door_top - p.wall, front + 1e-3),
@@ -115,7 +116,7 @@ def _body(p: OvenParameters, front: float) -> Manifold:
     cuts = [cavity]
     if p.drawer_groove:
         y = 0.86 * p.plinth_height
-        cuts.append(box((-w - 1e-3, y, front + t - 0.012), (w + 1e-3, y + 0.008, front + t + 1e-3)))
+        cuts.append(box((-w - 1e-3, y, plinth_front - 0.012), (w + 1e-3, y + 0.008, plinth_front + 1e-3)))
     if p.display:
         cuts.append(_panel_display(p, door_top, front + t))
     solids = [subtract(union([carcass, panel, plinth]), cuts), *_rack_bars(p, front)]

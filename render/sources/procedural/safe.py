@@ -89,7 +89,7 @@ def build(p: SafeParameters) -> Design:
     if p.inset_door:
         pivot = np.array([-p.width / 2 + p.wall - 0.012, p.height / 2, front + 0.008])
     else:
-        pivot = np.array([-p.width / 2 - 0.004, p.height / 2, front + _GAP + 0.5 * p.door_thickness])
+        pivot = np.array([-p.width / 2 - _KNUCKLE_RADIUS, p.height / 2, front + _GAP + 0.5 * p.door_thickness])
     parts = {"body": _body(p, front, pivot), "door": _door(p, front, pivot)}
     axis = np.array([0.0, -1.0, 0.0])
     if p.right_hinged:
@@ -120,8 +120,16 @@ def _body_knuckle(p: SafeParameters, front: float, pivot: np.ndarray, low: float
     if p.inset_door:
         mount = box((x - 0.005, low, front - 0.004), (x + 0.006, high, z))
     else:  # an angle that reaches from the side wall to the hinge line in front of it
-        bent = [(front - 0.02, x - 0.005), (front - 0.02, x + 0.006), (front, x + 0.006), (front, x + 0.002)]
-        mount = extrude(polygon([(u, v) for v, u in [*bent, (z, x + 0.002), (z, x - 0.005)]]), "y", low, high)
+        wall, bent, back = -p.width / 2 + 0.002, x + 0.002, front - 0.02
+        angle = [
+            (x - 0.005, back),
+            (wall, back),
+            (wall, front - 0.004),
+            (bent, front - 0.004),
+            (bent, z),
+            (x - 0.005, z),
+        ]
+        mount = extrude(polygon(angle), "y", low, high)
     return [cylinder(pivot, "y", low, high, _KNUCKLE_RADIUS, segments=16), mount]
 
 
