@@ -33,6 +33,8 @@ from datamodules.articulated_dataset import ArticulatedDataset
 from datamodules.geometry import invert_se3, se3, transform_points
 
 registration = o3d.pipelines.registration
+SCREEN_ITERATIONS = 5
+SCREEN_POINTS = 48
 
 
 @dataclass(frozen=True)
@@ -46,8 +48,8 @@ class Options:
         correspondence_distance: Largest distance of corresponding points, in cloud units.
         iterations: ICP iterations at most.
         template_points: Points of every template part.
-        screen: Not in the paper. If set, all hypotheses of a template run for 3 iterations only, and just this many of
-            them, those with the smallest inlier RMSE, go on to the end.
+        screen: Not in the paper. If set, all hypotheses first run with few points and iterations (`SCREEN_POINTS`,
+            `SCREEN_ITERATIONS`), and only this many, those with the smallest inlier RMSE, run in full.
         seed: Of templates, point subsets and initial translations.
     """
 
@@ -119,9 +121,9 @@ def register_part(
     options: Options,
 ) -> tuple[np.ndarray, float]:  # [4, 4], inlier RMSE
     """Best pose of a template part over all initial poses; infinite error if nothing ever corresponded."""
-    source, target = point_cloud(template), point_cloud(observed)
+    target = point_cloud(observed)
 
-    def icp(pose: np.ndarray, iterations: int) -> tuple[float, np.ndarray]:
+    def icp(source: o3d.geometry.PointCloud, pose: np.ndarray, iterations: int) -> tuple[float, np.ndarray]:
         result = registration.registration_icp(
             source,
             target,
@@ -136,8 +138,11 @@ def register_part(
 
     poses = list(initial_poses(template, observed, options).numpy())
     if options.screen is not None:
-        poses = [pose for _, pose in sorted((icp(p, 3) for p in poses), key=lambda r: r[0])[: options.screen]]
-    rmse, pose = min((icp(p, options.iterations) for p in poses), key=lambda r: r[0])
+        few = point_cloud(template[:SCREEN_POINTS])
+        order = np.argsort([icp(few, pose, SCREEN_ITERATIONS)[0] for pose in poses], kind="stable")
+        poses = [poses[i] for i in order[: options.screen]]
+    full = point_cloud(template)
+    rmse, pose = min((icp(full, pose, options.iterations) for pose in poses), key=lambda r: r[0])
     return pose, rmse
 
 
@@ -148,8 +153,9 @@ def oracle_icp(
 ) -> Prediction:
     """Part poses by registration of ground-truth parts; ICP predicts no joints, so the prediction has none (J = 0).
 
-    The canonical space of a part is the labelled one, centred on the part (`part_center` of the winning template). A
-    part that was not observed at all is put on the cloud's centroid, unrotated.
+    Canonical part spaces are the perfect oracle's, so both share one calibration: labelled axes, and the bounding-box
+    centre of the winning template's part as origin. A part that was not observed at all is put on the cloud's centroid,
+    unrotated.
 
     Args:
         labels: shard arrays of B test clouds; of these `points`, and the true part of every point.
@@ -195,15 +201,6 @@ def oracle_icp(
     )
 
 
-def centred_oracle(labels: dict[str, Tensor]) -> Prediction:
-    """The perfect oracle with every canonical part space centred on its part, as Oracle ICP's are."""
-    truth, center = perfect_oracle(labels), labels["part_center"]
-    identity = torch.eye(3, dtype=center.dtype).expand(*center.shape, 3)
-    return replace(
-        truth, part_pose=truth.part_pose @ se3(identity, center), part_shape=truth.part_shape - center[:, :, None]
-    )
-
-
 def choose_views(
     instance: np.ndarray,  # [S]
     templates: int,
@@ -220,7 +217,7 @@ def choose_views(
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run Oracle ICP on the test split of a generated set and report it like a network."""
-    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser = argparse.ArgumentParser("python -m articulate_ssl.baselines.oracle_icp", description=main.__doc__)
     parser.add_argument("--root", default="data", help="folder that `make data` wrote to")
     parser.add_argument("--category", required=True)
     parser.add_argument("--source", default="procedural")
@@ -261,7 +258,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     views = choose_views(train.labels["instance"], args.templates, args.template_views if partial else 1, args.seed)
     templates = [make_template(train.__getitems__(v.tolist()), options) for v in views]
     labels = train.__getitems__(np.linspace(0, len(train) - 1, min(len(train), 128)).astype(int).tolist())
-    metrics = ArticulatedPoseMetrics(calibrate(centred_oracle(labels), labels))
+    metrics = ArticulatedPoseMetrics(calibrate(perfect_oracle(labels), labels))
     seconds = 0.0
     for batch in data.test_dataloader():
         start = time.perf_counter()

@@ -8,7 +8,7 @@ from torch.nn.functional import one_hot
 
 from articulate_ssl.metrics.functional import nearest_index
 from articulate_ssl.prediction import Prediction
-from datamodules.geometry import invert_se3, transform_points
+from datamodules.geometry import invert_se3, se3, transform_points
 
 
 def part_points(
@@ -28,27 +28,28 @@ def part_points(
 def perfect_oracle(labels: dict[str, Tensor]) -> Prediction:
     """The labels, said as a prediction.
 
-    Every input point takes the part of its nearest dense point, part shapes are the observed points themselves, moved
-    back to rest, and the canonical spaces are the labelled object frame.
+    Every input point takes the part of its nearest dense point, and part shapes are the observed points themselves,
+    moved back to rest. The canonical object space is the labelled one; every canonical part space has the same axes and
+    the part's bounding-box centre as its origin, which is the point that translation errors compare.
 
     Args:
         labels: shard arrays of B clouds; `points` [B, N, 3] are the clouds under test.
     """
-    points, pose = labels["points"], labels["part_pose"]
+    points, object_to_part, center = labels["points"], labels["part_pose"], labels["part_center"]
     clouds, count, _ = points.shape
-    num_parts = pose.shape[1]
+    num_parts = center.shape[1]
+    pose = object_to_part @ se3(torch.eye(3, dtype=center.dtype, device=center.device), center)
     nearest = nearest_index(points, labels["dense_points"])[1]
     part_id = labels["dense_part_id"].long().gather(1, nearest)
-    center = transform_points(pose, labels["part_center"][:, :, None]).squeeze(2)  # [B, K, 3]
     observed = torch.stack(
         [
-            torch.stack([part_points(points[b], part_id[b], k, count, center[b, k]) for k in range(num_parts)])
+            torch.stack([part_points(points[b], part_id[b], k, count, pose[b, k, :3, 3]) for k in range(num_parts)])
             for b in range(clouds)
         ]
     )  # [B, K, N, 3]
     parent, child = labels["joint_parent"].long(), labels["joint_child"].long()
     base = next(k for k in range(num_parts) if k not in set(child[0].tolist()))
-    base_pose = pose[:, base]
+    base_pose = object_to_part[:, base]
     to_canonical = invert_se3(base_pose)
     axis, pivot = labels["joint_axis"], labels["joint_pivot"]
     return Prediction(
@@ -56,7 +57,7 @@ def perfect_oracle(labels: dict[str, Tensor]) -> Prediction:
         part_probability=one_hot(part_id, num_parts).to(points.dtype),
         part_pose=pose,
         part_shape=transform_points(invert_se3(pose), observed),
-        assembly=torch.zeros_like(center),
+        assembly=center,
         base_pose=base_pose,
         joint_parent=parent,
         joint_child=child,

@@ -119,7 +119,9 @@ def cloud_errors(
     legacy_rotation, legacy_translation = part_pose_errors(prediction, labels, calibration, legacy_slot)
 
     points = labels["points"]
-    reconstruction = transform_points(prediction.part_pose, prediction.part_shape).flatten(1, 2).to(points.dtype)
+    # In float64, because a mixed-precision network may hand over poses and shapes of different types.
+    posed = transform_points(prediction.part_pose.double(), prediction.part_shape.double())  # [B, K, M, 3]
+    reconstruction = posed.flatten(1, 2).to(points.dtype)
     return {
         "r_err_deg": rotation.rad2deg(),
         "t_err": translation,

@@ -111,7 +111,7 @@ def ransac(
     count = len(samples)
     draws = torch.rand(HYPOTHESES, count, generator=generator).argsort(dim=1)[:, :SAMPLE_SIZE].to(samples.device)
     hypotheses = mean(samples[draws])
-    inlier = torch.stack([distance(h[None], samples) < threshold for h in hypotheses])  # [H, S]
+    inlier = torch.cat([distance(h[:, None], samples[None]) < threshold for h in hypotheses.split(50)])  # [H, S]
     best = inlier.sum(1).argmax()
     if not inlier[best].any():
         return hypotheses[best], inlier[best].double().mean()
