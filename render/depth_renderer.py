@@ -36,7 +36,7 @@ class DepthRenderer:
         Raises:
             RendererUnavailable: if there is no working EGL.
         """
-        self._gl = _offscreen_renderer()
+        self._gl = offscreen_renderer()
         import pyrender
 
         self._flags = pyrender.RenderFlags.SEG
@@ -100,7 +100,7 @@ def _is_solid(mesh: trimesh.Trimesh) -> bool:
 
 
 @cache
-def _offscreen_renderer():
+def offscreen_renderer():
     """The process's one OpenGL context."""
     try:
         import pyrender
