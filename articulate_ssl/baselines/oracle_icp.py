@@ -197,7 +197,7 @@ def oracle_icp(
         joint_state=none,
         canonical_axis=none[..., None].expand(-1, -1, 3),
         canonical_pivot=none[..., None].expand(-1, -1, 3),
-        reconstruction_error=distance.amin(-1).mean(-1),
+        reconstruction_error=distance.amin(-1).mean(-1).to(points.dtype),
     )
 
 

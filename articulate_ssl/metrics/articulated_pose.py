@@ -121,17 +121,17 @@ def cloud_errors(
     points = labels["points"]
     # In float64, because a mixed-precision network may hand over poses and shapes of different types.
     posed = transform_points(prediction.part_pose.double(), prediction.part_shape.double())  # [B, K, M, 3]
-    reconstruction = posed.flatten(1, 2).to(points.dtype)
+    reconstruction = posed.flatten(1, 2)
     return {
         "r_err_deg": rotation.rad2deg(),
         "t_err": translation,
         "flip_rate": (rotation.rad2deg() > FLIP_DEG).double(),
         "seg_miou": iou.gather(1, slot[:, None]).squeeze(1),
-        "chamfer_l1": chamfer_l1(points, reconstruction).double(),
+        "chamfer_l1": chamfer_l1(points, reconstruction),
         "legacy_r_err_deg": legacy_fold(legacy_rotation).rad2deg(),
         "legacy_t_err": legacy_translation,
         "legacy_seg_miou": iou.gather(1, legacy_slot[:, None]).squeeze(1),
-        "legacy_chamfer_l1": legacy_chamfer(points, reconstruction).double(),
+        "legacy_chamfer_l1": legacy_chamfer(points, reconstruction),
         **joint_errors(prediction, labels, calibration),
     }
 

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import roma
 import torch
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 PARALLEL_BELOW = math.radians(1.0)
@@ -94,20 +96,20 @@ def state_error(
 def nearest_index(
     query: Tensor,  # [B, Q, 3]
     points: Tensor,  # [B, N, 3]
-) -> tuple[Tensor, Tensor]:  # [B, Q] distance, [B, Q] int64
+) -> tuple[Tensor, Tensor]:  # [B, Q] float64 distance, [B, Q] int64
     """Distance to, and index of, the nearest of `points` for every query point."""
-    # One cloud at a time bounds the memory; the matrix-product form of cdist is off by 1e-3 at small distances.
+    # k-d trees on the CPU: five times faster than a dense table there, and exact where matrix products lose digits.
     pairs = [
-        torch.cdist(q, p, compute_mode="donot_use_mm_for_euclid_dist").min(dim=-1)
-        for q, p in zip(query, points, strict=True)
+        cKDTree(p).query(q) for q, p in zip(query.double().cpu().numpy(), points.double().cpu().numpy(), strict=True)
     ]
-    return torch.stack([p.values for p in pairs]), torch.stack([p.indices for p in pairs])
+    distance, index = (torch.from_numpy(np.stack(values)).to(query.device) for values in zip(*pairs, strict=True))
+    return distance, index
 
 
 def chamfer_l1(
     first: Tensor,  # [B, N, 3]
     second: Tensor,  # [B, M, 3]
-) -> Tensor:  # [B]
+) -> Tensor:  # [B] float64
     """Mean of the two directions' mean unsquared nearest-neighbour distances."""
     return (nearest_index(first, second)[0].mean(-1) + nearest_index(second, first)[0].mean(-1)) / 2
 
@@ -185,7 +187,7 @@ def legacy_pivot_error(
 def legacy_chamfer(
     first: Tensor,  # [B, N, 3]
     second: Tensor,  # [B, M, 3]
-) -> Tensor:  # [B]
+) -> Tensor:  # [B] float64
     """Mean of the two directions' root-mean-square nearest-neighbour distances, which the original calls L1."""
     rms = [nearest_index(a, b)[0].square().mean(-1).sqrt() for a, b in ((first, second), (second, first))]
     return (rms[0] + rms[1]) / 2

@@ -97,6 +97,26 @@ def test_ransac_is_deterministic_and_refits_on_inliers():
     assert rotation_error(runs[0][0], torch.eye(3, dtype=torch.float64)).rad2deg() < 0.6
 
 
+def ransac_naive(samples, draws, threshold):
+    """One hypothesis after another."""
+    best, most = None, -1
+    for draw in draws:
+        hypothesis = chordal_mean(samples[draw][None])[0]
+        inlier = torch.stack([rotation_error(hypothesis, s) < threshold for s in samples])
+        if inlier.sum() > most:
+            best, most = inlier, inlier.sum()
+    return chordal_mean(samples[best][None])[0]
+
+
+def test_ransac_equals_naive(monkeypatch):
+    monkeypatch.setattr("articulate_ssl.metrics.calibration.HYPOTHESES", 20)
+    generator = torch.Generator().manual_seed(0)
+    samples = roma.rotvec_to_rotmat(0.1 * torch.randn(15, 3, generator=generator, dtype=torch.float64))
+    draws = torch.rand(20, 15, generator=torch.Generator().manual_seed(5)).argsort(dim=1)[:, :5]
+    found, _ = ransac(samples, chordal_mean, rotation_error, 0.1, torch.Generator().manual_seed(5))
+    torch.testing.assert_close(found, ransac_naive(samples, draws, 0.1))
+
+
 @pytest.mark.parametrize("count", [1, 3])
 def test_fewer_clouds_than_a_ransac_sample(count):
     labels = articulated_labels(clouds=count, num_parts=2)

@@ -142,14 +142,14 @@ def test_state_error_wraps_turns_but_not_lengths():
 @pytest.mark.parametrize(("count", "other"), [(1, 1), (1, 7), (20, 13)])
 def test_nearest_and_chamfer_equal_loops(count, other):
     first, second = unit(2, count, 3).float(), unit(2, other, 3, seed=1).float()
-    table = (first[:, :, None] - second[:, None]).double().norm(dim=-1)
+    table = (first[:, :, None].double() - second[:, None].double()).norm(dim=-1)
     distance, index = nearest_index(first, second)
-    torch.testing.assert_close(distance.double(), table.amin(2), atol=1e-6, rtol=0)
+    torch.testing.assert_close(distance, table.amin(2))
     assert torch.equal(index, table.argmin(2))
     expected = (table.amin(2).mean(1) + table.amin(1).mean(1)) / 2
-    torch.testing.assert_close(chamfer_l1(first, second).double(), expected, atol=1e-6, rtol=0)
+    torch.testing.assert_close(chamfer_l1(first, second), expected)
     expected = (table.amin(2).square().mean(1).sqrt() + table.amin(1).square().mean(1).sqrt()) / 2
-    torch.testing.assert_close(legacy_chamfer(first, second).double(), expected, atol=1e-6, rtol=0)
+    torch.testing.assert_close(legacy_chamfer(first, second), expected)
 
 
 def test_chamfer_of_identical_clouds_is_zero():
