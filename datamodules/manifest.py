@@ -85,9 +85,13 @@ class Manifest:
             raise ValueError("an instance id appears twice; splits must not share instances")
         if set(self.rest_state) != set(ids):
             raise ValueError("rest_state must name exactly the instances of the splits")
+        if not set(self.joint_types) <= {0, 1}:
+            raise ValueError(f"joint_types are {list(self.joint_types)}, expected 0 (revolute) or 1 (prismatic)")
         num_joints = len(self.joint_types)
         if len(self.articulation_range) != num_joints or any(len(q) != num_joints for q in self.rest_state.values()):
             raise ValueError(f"articulation_range and every rest_state must have {num_joints} entries, one per joint")
+        if any(shard.samples < 1 for split in SPLITS for shard in self.shards[split]):
+            raise ValueError("a shard has no samples")
         for split in SPLITS:
             names = [shard.name for shard in self.shards[split]]
             if len(set(names)) != len(names) or any(Path(name).name != name for name in names):

@@ -28,9 +28,11 @@ import io
 import os
 import struct
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -65,6 +67,20 @@ SHARD_ARRAYS: dict[str, ArraySpec] = {
     "center": ArraySpec("float32", ("S", 3)),
     "scale": ArraySpec("float32", ("S",)),
 }
+
+# What zipfile and numpy raise on damaged headers; RuntimeError covers unsupported and encrypted members.
+STRUCTURE_ERRORS = (
+    EOFError,
+    KeyError,
+    MemoryError,
+    OSError,
+    OverflowError,
+    RuntimeError,
+    ValueError,
+    struct.error,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 REPAIR = "Delete it and repeat the `make data` command that made the set: it makes only what is missing."
 
@@ -122,10 +138,11 @@ def read_shard(path: str | os.PathLike, expected_sha256: str | None = None) -> d
         raise ShardError(
             f"{path}: shard is damaged: its SHA-256 is {actual[:12]}…, not {expected_sha256[:12]}…. {REPAIR}"
         )
-    try:
-        arrays = _map_npz(path)
-    except (zipfile.BadZipFile, ValueError, EOFError, struct.error, KeyError) as error:
-        raise ShardError(f"{path}: shard is damaged or truncated ({error}). {REPAIR}") from error
+    with open(path, "rb") as file:
+        try:
+            arrays = _map_npz(file)
+        except STRUCTURE_ERRORS as error:
+            raise ShardError(f"{path}: shard is damaged or truncated ({error}). {REPAIR}") from error
     problem = schema_problem({name: (array.dtype, array.shape) for name, array in arrays.items()})
     if problem is not None:
         raise ShardError(f"{path}: not a shard of this format: {problem}. {REPAIR}")
@@ -154,7 +171,7 @@ def schema_problem(arrays: Mapping[str, tuple[np.dtype, tuple[int, ...]]]) -> st
     return None
 
 
-def _write_npz(file, arrays: Mapping[str, np.ndarray]) -> None:
+def _write_npz(file: BinaryIO, arrays: Mapping[str, np.ndarray]) -> None:
     """An uncompressed npz in the order of `SHARD_ARRAYS`, its bytes a function of the arrays alone."""
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name in SHARD_ARRAYS:
@@ -170,11 +187,11 @@ def _write_npz(file, arrays: Mapping[str, np.ndarray]) -> None:
             archive.writestr(member, content.getbuffer())
 
 
-def _map_npz(path: Path) -> dict[str, np.ndarray]:
+def _map_npz(file: BinaryIO) -> dict[str, np.ndarray]:
     """Every array of an npz, mapped into memory where it is stored uncompressed."""
     arrays = {}
-    mapped = np.memmap(path, dtype=np.uint8, mode="r")
-    with open(path, "rb") as file, zipfile.ZipFile(file) as archive:
+    mapped = np.memmap(file, dtype=np.uint8, mode="r")
+    with zipfile.ZipFile(file) as archive:
         for member in archive.infolist():
             name = member.filename.removesuffix(".npy")
             with archive.open(member) as content:

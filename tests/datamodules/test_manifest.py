@@ -37,6 +37,8 @@ def test_saving_what_was_loaded_gives_the_same_bytes(synthetic_set, tmp_path):
         ({"instances": {"train": ["a"], "test": ["a"]}}, "twice"),
         ({"rest_state": {}}, "rest_state"),
         ({"joint_types": [0, 0]}, "2 entries"),
+        ({"joint_types": ["hinge"]}, "joint_types are"),
+        ({"shards": {"train": [{"name": "a", "samples": 0, "sha256": ""}], "test": []}}, "a shard has no samples"),
         ({"shards": {"train": [{"name": "../a", "samples": 1, "sha256": ""}], "test": []}}, "plain file names"),
         ({"shards": {"train": [{"name": "a"}], "test": []}}, "damaged"),
         ({"shards": 3}, "damaged"),
