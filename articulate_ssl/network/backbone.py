@@ -93,7 +93,7 @@ class EquivariantBackbone(nn.Module):
             if (N, M) not in found:
                 centers = None if M == N else torch.arange(M, device=points.device).expand(B, M)
                 found[N, M] = nearest_neighbors(points[:, :N], self.num_neighbors, centers)
-            neighborhoods.append(correlate(found[N, M], radius, self.kernel_points, N))
+            neighborhoods.append(correlate(found[N, M], radius, self.kernel_points))
             N = M
         return neighborhoods
 

@@ -18,8 +18,8 @@ def group_convolution(
     index, correlation = neighborhood.index, neighborhood.weight
     if features is None:
         features = weight.new_ones(index.shape[0], neighborhood.num_points, permutation.shape[0], 1)
-    rotated = correlation[:, :, permutation]  # [B, M, G, K, n]: entry (g, k) belongs to kernel point A_g kappa_k
+    rotated = correlation[..., permutation]  # [B, M, n, G, K]: entry (g, k) belongs to kernel point A_g kappa_k
     sample = torch.arange(index.shape[0], device=index.device)[:, None, None]
     grouped = features[sample, index]  # [B, M, n, G, C]
-    aggregate = torch.einsum("bmgkn,bmngc->bmgkc", rotated, grouped)
+    aggregate = torch.einsum("bmngk,bmngc->bmgkc", rotated, grouped)
     return torch.einsum("bmgkc,kcd->bmgd", aggregate, weight)
