@@ -1,4 +1,4 @@
-"""Hand a prediction over in the frame and the units of the user's scan: JSON, coloured clouds, a URDF with meshes.
+"""Hand a prediction over in the frame and the units of the user's scan: JSON, coloured clouds, URDF, a picture.
 
 Convention of `prediction.json` (schema 1):
     Lengths are in the units of the scan, angles in radians. Poses are 4x4, row by row, and act on column vectors.
@@ -23,7 +23,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from articulate_ssl.inference.articulation import articulate, posed_parts, to_input_frame
+from articulate_ssl.inference.checkpoint_file import CheckpointError
 from articulate_ssl.inference.part_colour import part_colour
+from articulate_ssl.inference.picture import draw_prediction
 from articulate_ssl.inference.point_cloud_io import save_coloured_ply
 from articulate_ssl.inference.urdf import JOINT_TYPE_NAMES, write_urdf
 from articulate_ssl.prediction import Prediction
@@ -31,6 +33,7 @@ from datamodules.atomic import atomic_write
 from datamodules.geometry import PRISMATIC
 
 SCHEMA_VERSION = 1
+MAX_DRAWN_POINTS = 4096
 
 
 def part_of_points(
@@ -53,7 +56,7 @@ def write_prediction(
     category: str,
     checkpoint: str,
 ) -> list[Path]:
-    """Write `parts.ply`, `reconstruction.ply`, `object.urdf`, `meshes/part_<k>.stl` and `prediction.json`.
+    """Write `parts.ply`, `reconstruction.ply`, `object.urdf`, `meshes/part_<k>.stl`, `picture.png`, `prediction.json`.
 
     Every file is replaced whole or not at all, and nothing else in `folder` is touched. The JSON comes last: where it
     is new, the rest is.
@@ -62,13 +65,14 @@ def write_prediction(
         The files written.
 
     Raises:
-        ValueError: if `prediction` holds more than one cloud, or values that are not finite.
+        ValueError: if `prediction` holds more than one cloud.
+        CheckpointError: if `prediction` is not finite.
     """
     if len(prediction.part_id) != 1:
         raise ValueError(f"write_prediction writes one cloud at a time, got a batch of {len(prediction.part_id)}")
     broken = [f.name for f in fields(prediction) if not getattr(prediction, f.name).isfinite().all()]
     if broken:
-        raise ValueError(
+        raise CheckpointError(
             f"{checkpoint}: predicts NaN or infinite values ({', '.join(broken)}); its training diverged, train again"
         )
     folder = Path(folder)
@@ -84,6 +88,9 @@ def write_prediction(
     colours = part_colour(np.arange(metric.num_parts))
     save_coloured_ply(files[1], shapes.reshape(-1, 3).numpy(), np.repeat(colours, shapes.shape[1], axis=0))
     files += write_urdf(folder, metric, limits, category)
+    files.append(folder / "picture.png")
+    drawn = np.random.default_rng(0).permutation(len(cloud))[:MAX_DRAWN_POINTS]
+    draw_prediction(metric, cloud[drawn], part_id[drawn], limits, files[-1])
     files.append(folder / "prediction.json")
     summary = describe(metric, part_id, limits)
     summary |= {

@@ -9,12 +9,19 @@ import yourdfpy
 
 from articulate_ssl.inference import export, urdf
 from articulate_ssl.inference.articulation import posed_parts, to_input_frame
+from articulate_ssl.inference.checkpoint_file import CheckpointError
 from articulate_ssl.inference.export import write_prediction
 from articulate_ssl.inference.part_colour import part_colour
 from articulate_ssl.prediction import Prediction
 
 OBJECTS = [synthetic.laptop, synthetic.drawer, synthetic.arm]
 CENTER, SCALE = np.array([10.0, -3.0, 5.0]), 0.4
+
+
+@pytest.fixture(autouse=True)
+def quick_picture(monkeypatch):
+    """Pictures have tests of their own, and take a second each."""
+    monkeypatch.setattr(export, "draw_prediction", lambda *arguments: arguments[-1].touch())
 
 
 def write(folder, make, center=CENTER, scale=SCALE, **changes):
@@ -39,7 +46,7 @@ def write(folder, make, center=CENTER, scale=SCALE, **changes):
 def test_the_folder_holds_what_was_promised_and_no_more(tmp_path, make):
     prediction, files, _ = write(tmp_path, make)
     meshes = {f"meshes/part_{k}.stl" for k in range(prediction.num_parts)}
-    expected = {"prediction.json", "parts.ply", "reconstruction.ply", "object.urdf"} | meshes
+    expected = {"prediction.json", "parts.ply", "reconstruction.ply", "object.urdf", "picture.png"} | meshes
     assert {str(f.relative_to(tmp_path)) for f in files} == expected
     assert {str(f.relative_to(tmp_path)) for f in tmp_path.rglob("*") if f.is_file()} == expected
 
@@ -141,7 +148,7 @@ def test_every_point_of_the_scan_is_coloured_by_its_part(tmp_path):
 def test_a_diverged_prediction_is_refused_before_anything_is_written(tmp_path):
     prediction, _ = synthetic.laptop()
     prediction.part_pose[0, 1, 0, 0] = float("nan")
-    with pytest.raises(ValueError, match=r"thing.ckpt: predicts NaN.*part_pose.*train again"):
+    with pytest.raises(CheckpointError, match=r"thing.ckpt: predicts NaN.*part_pose.*train again"):
         write(tmp_path / "out", synthetic.laptop, prediction=prediction)
     assert not (tmp_path / "out").exists()
 

@@ -1,0 +1,123 @@
+"""`articulate-ssl predict CLOUD --ckpt …`: from a scan and a checkpoint to a folder of results."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from articulate_ssl.inference.checkpoint_file import CheckpointError
+from articulate_ssl.inference.export import write_prediction
+from articulate_ssl.inference.point_cloud_io import PointCloudError, load_point_cloud
+from articulate_ssl.prediction import Prediction
+
+BAD_INPUT = 2
+
+
+class CloudPredictor(Protocol):
+    """What this command asks of a trained module.
+
+    Attributes:
+        category: What it was trained on.
+        state_range: [J, 2] lowest and highest joint state, as `Prediction.joint_state`.
+    """
+
+    category: str
+    state_range: Tensor
+
+    def predict_cloud(
+        self,
+        points: np.ndarray,  # [N, 3] any unit and origin
+        refine: bool,
+    ) -> tuple[Prediction, np.ndarray, float, np.ndarray]:
+        """Prediction (B = 1), center [3] and scale of the normalisation, and the normalised points that it labels."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument("cloud", type=Path, help="scan of one object: .ply, .pcd, .npy, .npz or .obj, in any unit")
+    parser.add_argument("--ckpt", type=Path, required=True, help="checkpoint that `lightning fit` wrote")
+    parser.add_argument("--out", type=Path, help="folder for the results (default: <name of the scan>-prediction)")
+    parser.add_argument("--device", type=_device, default="cpu", help="cpu (default), cuda, cuda:1, …")
+    parser.add_argument(
+        "--refine",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="sharpen the prediction by a few optimisation steps on the reconstruction (default: yes)",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Predict, write the results, print a summary.
+
+    Returns:
+        Exit code: 0, or 2 for a bad scan, checkpoint or output folder, with one message on stderr.
+    """
+    # Imported here: the network takes long to import, and --help needs none of it.
+    from articulate_ssl.checkpoint import load_module
+
+    out = args.out or Path(f"{args.cloud.stem}-prediction")
+    try:
+        cloud = load_point_cloud(args.cloud)
+        module: CloudPredictor = load_module(args.ckpt).to(args.device).eval()
+        prediction, center, scale, points = module.predict_cloud(cloud, refine=args.refine)
+        files = write_prediction(
+            out, prediction, points, center, scale, cloud, module.state_range, module.category, str(args.ckpt)
+        )
+    except (PointCloudError, CheckpointError, OSError) as error:
+        print(f"articulate-ssl predict: {error}", file=sys.stderr)
+        return BAD_INPUT
+    summary = json.loads((out / "prediction.json").read_text())
+    for table in (_parts_table(summary), _joints_table(summary)):
+        Console().print(table)
+    print(
+        f"reconstruction error {summary['reconstruction_error']:.4g}, kinematic error {summary['kinematic_error']:.4g}"
+    )
+    print("wrote", *files, sep="\n  ")
+    return 0
+
+
+def _device(name: str) -> torch.device:
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise argparse.ArgumentTypeError(f"{name!r} is no device; use cpu, cuda or cuda:<index>") from error
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise argparse.ArgumentTypeError(
+            f"{name!r}: this machine has {torch.cuda.device_count()} CUDA devices; use cpu"
+        )
+    return device
+
+
+def _parts_table(summary: dict) -> Table:
+    table = Table("part", "parent", "points", "size", "position", title=f"{summary['category']}: parts")
+    for part in summary["parts"]:
+        parent = "base" if part["parent"] is None else str(part["parent"])
+        position = [row[3] for row in part["pose"][:3]]
+        table.add_row(
+            str(part["id"]), parent, str(part["num_points"]), _vector(part["canonical_size"]), _vector(position)
+        )
+    return table
+
+
+def _joints_table(summary: dict) -> Table:
+    table = Table("joint", "type", "moves", "state", "axis", "pivot", title="joints (frame and unit of the scan)")
+    for joint in summary["joints"]:
+        state = joint["state"]
+        text = f"{math.degrees(state):.1f}°" if joint["type"] == "revolute" else f"{state:.4g}"
+        moves = f"{joint['child']} on {joint['parent']}"
+        table.add_row(joint["name"], joint["type"], moves, text, _vector(joint["axis"]), _vector(joint["pivot"]))
+    return table
+
+
+def _vector(values: list[float]) -> str:
+    return " ".join(f"{value:.3g}" for value in values)
