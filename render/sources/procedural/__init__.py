@@ -8,10 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from render.articulated_object import ArticulatedObject
 from render.category import CategorySpec
+from render.seeds import generator_for
 from render.sources.procedural import drawer, eyeglasses, laptop, oven, safe, washing_machine
 from render.sources.procedural.shapes import to_trimesh
 
@@ -39,9 +38,15 @@ class ProceduralSource:
         return [f"{self.spec.name}-{i:04d}" for i in range(NUM_INSTANCES)]
 
     def load(self, instance_id: str) -> ArticulatedObject:
-        """The instance of this id, closed (or unfolded), in metres."""
-        entropy = [self.seed, *instance_id.encode()]
-        design = GENERATORS[self.spec.name](np.random.default_rng(np.random.SeedSequence(entropy)))
+        """The instance of this id, closed (or unfolded), in metres.
+
+        Raises:
+            ValueError: if there is no such instance.
+        """
+        if instance_id not in self.instance_ids():
+            known = f"{self.spec.name}-0000 to {self.spec.name}-{NUM_INSTANCES - 1}"
+            raise ValueError(f"no procedural instance {instance_id!r} of {self.spec.name}; there are {known}")
+        design = GENERATORS[self.spec.name](generator_for(self.seed, "design", instance_id))
         meshes = tuple(to_trimesh(solid) for solid in design.parts.values())
         return ArticulatedObject(instance_id, self.spec.name, tuple(design.parts), meshes, design.joints).validate()
 
