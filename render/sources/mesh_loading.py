@@ -78,10 +78,11 @@ def _plain_obj(data: bytes) -> bytes:
             num_vertices += 1
             lines.append(b"v " + b" ".join(values[:3]))
         elif keyword == b"f":
-            indices = [int(value.split(b"/")[0]) for value in values]
-            if len(indices) < 3 or 0 in indices:
+            relative = [int(value.split(b"/")[0]) for value in values]
+            indices = [i if i >= 0 else i + num_vertices + 1 for i in relative]
+            if len(indices) < 3 or min(indices) < 1:
                 raise ValueError(f"bad face {line.decode(errors='replace')!r}")
-            first, *others = (i if i > 0 else i + num_vertices + 1 for i in indices)
+            first, *others = indices
             lines += [b"f %d %d %d" % (first, *pair) for pair in pairwise(others)]
     return b"\n".join(lines) + b"\n"
 
