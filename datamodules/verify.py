@@ -149,7 +149,7 @@ def _value_checks(arrays: Arrays) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _motion_checks(arrays: Arrays, manifest: Manifest, split: str) -> Iterator[tuple[str, np.ndarray]]:
-    """Checks of part poses against joints and object rotation."""
+    """Checks of part poses against joints, object rotation and points."""
     pose = torch.from_numpy(arrays["part_pose"].astype(np.float64))
     parent, child = (torch.from_numpy(arrays[name].astype(np.int64)) for name in ("joint_parent", "joint_child"))
     axis, pivot = (torch.from_numpy(arrays[name].astype(np.float64)) for name in ("joint_axis", "joint_pivot"))
@@ -159,13 +159,33 @@ def _motion_checks(arrays: Arrays, manifest: Manifest, split: str) -> Iterator[t
     for j, joint_type in enumerate(manifest.joint_types):
         moved = arrays["joint_state"][:, j] - (rest[:, j] if joint_type == REVOLUTE else rest[:, j] / arrays["scale"])
         motion = screw_motion(axis[:, j], pivot[:, j], torch.from_numpy(moved).double(), joint_type)
+        lower, upper = manifest.articulation_range[j]
+        # In partial views the scale is not the diagonal that a prismatic range is stated in.
+        if joint_type == REVOLUTE or manifest.view == "complete":
+            outside = (moved < lower - TOLERANCE) | (moved > upper + TOLERANCE)
+            yield f"state of joint {j} is outside the articulation range", outside
         expected = motion @ pose[sample, parent[:, j]]
         difference = (expected - pose[sample, child[:, j]]).numpy()
         yield f"part_pose contradicts axis, pivot and state of joint {j}", _exceeds(difference)
+    if manifest.view == "complete":
+        yield "points are not centred on their mean", _exceeds(arrays["points"].mean(1, dtype=np.float64))
+        yield "points at rest reach beyond a box of diagonal 1", _rest_diagonal(arrays) > 1 + TOLERANCE
     is_base = np.ones(arrays["part_pose"].shape[:2], dtype=bool)
     np.put_along_axis(is_base, arrays["joint_child"].astype(np.int64), False, axis=1)
     difference = arrays["part_pose"][..., :3, :3] - arrays["object_rotation"][:, None]
     yield "the base part is not turned by object_rotation", _exceeds(difference) & is_base[..., None, None]
+
+
+def _rest_diagonal(arrays: Arrays) -> np.ndarray:  # [S]
+    """Bounding-box diagonal of the points, every one moved back to the rest state by its part's pose."""
+    lower, upper = np.inf, -np.inf
+    for part in range(arrays["part_pose"].shape[1]):
+        pose = arrays["part_pose"][:, part]
+        at_rest = (arrays["points"] - pose[:, None, :3, 3]) @ pose[:, :3, :3]
+        belongs = (arrays["part_id"] == part)[..., None]
+        lower = np.minimum(lower, np.where(belongs, at_rest, np.inf).min(1))
+        upper = np.maximum(upper, np.where(belongs, at_rest, -np.inf).max(1))
+    return np.linalg.norm(upper - lower, axis=-1)
 
 
 def _exceeds(error: np.ndarray) -> np.ndarray:
