@@ -136,6 +136,8 @@ class ArticulatedObject:
                 fail(f"joint {joint.name!r} has NaN or infinite axis, pivot or limits")
             if abs(np.linalg.norm(joint.axis) - 1) > 1e-6:
                 fail(f"joint {joint.name!r} has an axis of length {np.linalg.norm(joint.axis):.3g}, not 1")
+            if joint.lower == joint.upper:
+                fail(f"joint {joint.name!r} has limits [{joint.lower}, {joint.upper}] that leave no motion")
             if joint.lower > joint.upper:
                 fail(f"joint {joint.name!r} has reversed limits [{joint.lower}, {joint.upper}]")
         if sorted(children) != [k for k in range(self.num_parts) if k != self.base]:

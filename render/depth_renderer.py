@@ -47,9 +47,8 @@ class DepthRenderer:
             self._scene.add(pyrender.Mesh([pyrender.Primitive(positions=vertices, indices=faces)]))
             for vertices, faces in (_drawn_from_both_sides(mesh) for mesh in meshes)
         ]
-        bounds = np.array([mesh.bounds for mesh in meshes]).reshape(-1, 2, 3)
-        self._centers = np.append(bounds.mean(1), np.ones((len(meshes), 1)), axis=1)
-        self._radii = 0.5 * np.linalg.norm(bounds[:, 1] - bounds[:, 0], axis=1)
+        corners = np.array([trimesh.bounds.corners(mesh.bounds) for mesh in meshes]).reshape(-1, 8, 3)
+        self._corners = np.concatenate([corners, np.ones_like(corners[..., :1])], axis=-1)  # [K, 8, 4]
 
     def render(
         self,
@@ -65,10 +64,10 @@ class DepthRenderer:
             parts: Indices of the parts to draw, by default all.
 
         Raises:
-            ValueError: if the camera may be inside the object.
+            ValueError: if the camera is inside the object.
         """
-        depth = np.einsum("kb,kb->k", part_pose[:, 2], self._centers)
-        near, far = (depth - self._radii).min(), (depth + self._radii).max()
+        depth = np.einsum("kb,kcb->kc", part_pose[:, 2], self._corners)
+        near, far = depth.min(), depth.max()
         if near <= 0:
             raise ValueError(f"the camera is inside the object: its parts begin at depth {near:.3g}")
         self._camera.znear, self._camera.zfar = near * (1 - _DEPTH_MARGIN), far * (1 + _DEPTH_MARGIN)

@@ -5,7 +5,18 @@ from __future__ import annotations
 import fpsample
 import numpy as np
 
-_SMALLEST_TREE = 64
+_TREE_HEIGHT = 5
+
+
+def farthest_points_first(
+    points: np.ndarray,  # [N, 3], in random order
+    num_ordered: int = 2048,
+) -> np.ndarray:  # [N]
+    """A permutation that begins with a farthest-point order of `num_ordered` points; the others keep their order."""
+    first = farthest_point_order(points, min(num_ordered, len(points)))
+    others = np.ones(len(points), dtype=bool)
+    others[first] = False
+    return np.concatenate([first, np.flatnonzero(others)])
 
 
 def farthest_point_order(
@@ -22,6 +33,9 @@ def farthest_point_order(
     """
     if len(points) < num_points:
         raise ValueError(f"cannot choose {num_points} of {len(points)} points")
-    height = 5 if len(points) >= _SMALLEST_TREE else 1
-    order = fpsample.bucket_fps_kdline_sampling(points.astype(np.float32, copy=False), num_points, h=height)
+    if len(points) == 1:
+        return np.zeros(num_points, dtype=np.int64)
+    height = min(_TREE_HEIGHT, len(points).bit_length() - 1)
+    # Without a start index fpsample draws one from numpy's global generator.
+    order = fpsample.bucket_fps_kdline_sampling(points.astype(np.float32), num_points, h=height, start_idx=0)
     return order.astype(np.int64)

@@ -38,9 +38,8 @@ def generate(options: SetOptions, out: Path, workers: int, scheduler: str | None
         ValueError: if an option or an instance is unsound, or the folder holds a set made with other options.
         OSError: if the output cannot be written; what is finished stays.
     """
-    spec = load_category(options.category)
     folder = set_folder(out, options.category, options.source, options.view, options.protocol)
-    ids = split_instances(options, spec)
+    ids = split_instances(options)
     for split in SPLITS:
         (folder / split).mkdir(parents=True, exist_ok=True)
         remove_leftovers(folder / split)
@@ -55,20 +54,20 @@ def generate(options: SetOptions, out: Path, workers: int, scheduler: str | None
     for result in _with_progress(run_tasks(missing, workers, scheduler), len(missing), options):
         journal.append(result)
         done[result.split, result.name] = result
+        _require_same_structure(next(iter(done.values())), result)
     results = [done[task.split, task.name] for task in tasks]
-    _manifest(options, spec, ids, results).save(folder)
+    _manifest(options, ids, results).save(folder)
     journal.path.unlink()
     return folder
 
 
-def split_instances(options: SetOptions, spec: CategorySpec) -> dict[str, tuple[str, ...]]:
+def split_instances(options: SetOptions) -> dict[str, tuple[str, ...]]:
     """Instance ids of the splits: the first ones of the source train, the next ones test.
 
     Raises:
         ValueError: if the source has too few instances.
     """
-    root = None if options.root is None else Path(options.root)
-    ids = open_source(options.source, spec, root, options.seed).instance_ids()
+    ids = _instance_ids(options.category, options.source, options.root, options.seed)
     train, test = options.train_instances, options.test_instances
     if train + test > len(ids):
         raise ValueError(
@@ -76,6 +75,19 @@ def split_instances(options: SetOptions, spec: CategorySpec) -> dict[str, tuple[
             f"training and {test} test instances; pass smaller --train-instances and --test-instances"
         )
     return {"train": tuple(ids[:train]), "test": tuple(ids[train : train + test])}
+
+
+def _instance_ids(category: str, source: str, root: str | None, seed: int) -> list[str]:
+    return open_source(source, load_category(category), None if root is None else Path(root), seed).instance_ids()
+
+
+def default_split(spec: CategorySpec, available: int) -> tuple[int, int]:
+    """Numbers of training and test instances: the category's own, or all in the same ratio where there are fewer."""
+    train, test = spec.train_instances, spec.test_instances
+    if train + test > available:
+        test = min(max(1, round(available * test / (train + test))), available)
+        train = available - test
+    return train, test
 
 
 class Journal:
@@ -100,7 +112,7 @@ class Journal:
 
     def read(self) -> dict[tuple[str, str], ShardResult]:
         """Finished shards by split and name."""
-        results = [ShardResult(**line) for line in self._lines()[1:]]
+        results = [ShardResult(**{key: _tuples(value) for key, value in line.items()}) for line in self._lines()[1:]]
         return {(result.split, result.name): result for result in results}
 
     def _lines(self) -> list[dict]:
@@ -114,6 +126,11 @@ class Journal:
             except json.JSONDecodeError:
                 continue
         return lines
+
+
+def _tuples(value):
+    """JSON lists back as the tuples they were."""
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 def _described(options: SetOptions) -> dict:
@@ -160,9 +177,15 @@ def _with_progress(results: Iterable[ShardResult], total: int, options: SetOptio
         yield from progress.track(results, total=total, description=f"{options.category} {options.view} shards")
 
 
-def _manifest(
-    options: SetOptions, spec: CategorySpec, ids: dict[str, tuple[str, ...]], results: list[ShardResult]
-) -> Manifest:
+def _require_same_structure(first: ShardResult, other: ShardResult) -> None:
+    if (first.joint_types, len(first.part_names)) != (other.joint_types, len(other.part_names)):
+        raise ValueError(
+            f"instances {first.instance_id!r} (parts {', '.join(first.part_names)}) and {other.instance_id!r} (parts "
+            f"{', '.join(other.part_names)}) differ in their parts or joints; make a set of each kind"
+        )
+
+
+def _manifest(options: SetOptions, ids: dict[str, tuple[str, ...]], results: list[ShardResult]) -> Manifest:
     rest = {result.instance_id: tuple(result.rest_state) for result in results}
     ranges = [result.articulation_range for result in results]
     return Manifest(
@@ -173,10 +196,10 @@ def _manifest(
         source=options.source,
         view=options.view,
         protocol=options.protocol,
-        part_names=spec.parts,
-        joint_types=tuple(joint.type for joint in spec.joints),
+        part_names=results[0].part_names,
+        joint_types=results[0].joint_types,
         articulation_range=tuple(
-            (min(r[j][0] for r in ranges), max(r[j][1] for r in ranges)) for j in range(len(spec.joints))
+            (min(r[j][0] for r in ranges), max(r[j][1] for r in ranges)) for j in range(len(ranges[0]))
         ),
         instances=ids,
         rest_state=rest,
@@ -204,7 +227,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--workers", type=_at_least(1), default=os.cpu_count(), help="processes; 1 works in this process")
     add("--scheduler", help="address of a Dask scheduler (tcp://…) to use instead of local processes")
     add("--seed", type=_at_least(0), default=0)
-    add("--train-instances", type=_at_least(0), help="default: as in the category's specification")
+    add("--train-instances", type=_at_least(0), help="default: as the category's specification")
     add("--test-instances", type=_at_least(0), help="default: as in the category's specification")
     add("--states", type=_at_least(1), default=100, help="articulation states per instance")
     add("--rotations", type=_at_least(1), default=10, help="stored rotations of each complete test cloud")
@@ -229,7 +252,7 @@ def options_from(arguments: argparse.Namespace) -> SetOptions:
     """The options of a set, with the category's defaults filled in.
 
     Raises:
-        ValueError: if they contradict each other.
+        ValueError: if they contradict each other, or the source cannot be opened.
     """
     spec = load_category(arguments.category)
     if (arguments.root is None) != (arguments.source == "procedural"):
@@ -237,7 +260,12 @@ def options_from(arguments: argparse.Namespace) -> SetOptions:
         raise ValueError(f"source {arguments.source!r} {need} --root")
     if not 0 <= arguments.noise_std < 1:
         raise ValueError(f"--noise-std must be in [0, 1), not {arguments.noise_std}")
-    train, test = arguments.train_instances, arguments.test_instances
+    ids = _instance_ids(spec.name, arguments.source, arguments.root, arguments.seed)
+    train, test = default_split(spec, len(ids))
+    train = train if arguments.train_instances is None else arguments.train_instances
+    test = test if arguments.test_instances is None else arguments.test_instances
+    if train + test == 0:
+        raise ValueError("--train-instances and --test-instances are both 0: there is nothing to make")
     return SetOptions(
         category=spec.name,
         source=arguments.source,
@@ -245,8 +273,8 @@ def options_from(arguments: argparse.Namespace) -> SetOptions:
         view=arguments.view,
         protocol=arguments.protocol if arguments.view == "partial" else None,
         seed=arguments.seed,
-        train_instances=spec.train_instances if train is None else train,
-        test_instances=spec.test_instances if test is None else test,
+        train_instances=train,
+        test_instances=test,
         states=arguments.states,
         rotations=arguments.rotations,
         views=arguments.views,

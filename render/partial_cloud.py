@@ -17,13 +17,13 @@ from render.articulated_object import ArticulatedObject
 from render.camera import BACKGROUND, Camera, sample_view
 from render.category import ViewSpec
 from render.depth_renderer import DepthRenderer
-from render.farthest_point import farthest_point_order
+from render.farthest_point import farthest_points_first
 from render.posing import compose
 from render.ray_caster import RayCaster
 
 HONEST_MEAN_DISTANCE = 0.3  # of observed points to their centre, after normalisation; like a complete cloud's
 MAX_REJECTED = 200  # views in a row
-MAX_RESOLUTION = 4096
+MAX_RESOLUTION = 2048
 _REFERENCE_POINTS = 4096  # number of points to which a category's `min_visible_points` refers
 
 RENDERERS = {"egl": DepthRenderer, "ray-caster": RayCaster}
@@ -34,7 +34,7 @@ class PartialCloud:
     """One view of a posed object.
 
     Attributes:
-        points: [P, 3] metric, camera frame, in farthest-point order.
+        points: [P, 3] metric, camera frame, the first 2048 in farthest-point order.
         part_id: [P].
         rotation: [3, 3] object frame -> camera frame.
         translation: [3] object frame -> camera frame, metric.
@@ -123,7 +123,7 @@ class DepthSensor:
         )
 
     def _depth_points(self, pose: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """P points in farthest-point order and their part ids, chosen uniformly from the pixels that see the object."""
+        """P points and their part ids, chosen uniformly from the pixels that see the object."""
         resolution = self._resolution
         while True:
             camera = Camera(resolution)
@@ -137,12 +137,12 @@ class DepthSensor:
                     f"{self._instance.category} instance {self._instance.name!r}: a view shows fewer than "
                     f"{self._num_points} pixels of it even at {MAX_RESOLUTION} pixels width; lower --points"
                 )
-        chosen = rng.choice(seen, self._num_points, replace=False, shuffle=False)
+        chosen = rng.choice(seen, self._num_points, replace=False)
         chosen_depth = depth[chosen].astype(float)
         if self._noise_std > 0:
             chosen_depth += rng.normal(0.0, self._noise_std, len(chosen))
         points = camera.back_project(chosen % camera.resolution**2, chosen_depth)
-        order = farthest_point_order(points, self._num_points)
+        order = farthest_points_first(points)
         return points[order], part_id[chosen[order]]
 
     def _pixels(self, pose: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

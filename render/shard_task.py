@@ -90,6 +90,8 @@ class ShardResult:
     """What the manifest needs to know about a finished shard and its instance.
 
     Attributes:
+        part_names: K names.
+        joint_types: J types.
         rest_state: J joint coordinates at rest; radians, or length in the units of the source.
         articulation_range: J pairs (lower, upper) relative to rest; radians, or length / rest-state diagonal.
         rejected_views: Views drawn again because a part showed too few points.
@@ -100,6 +102,8 @@ class ShardResult:
     samples: int
     sha256: str
     instance_id: str
+    part_names: tuple[str, ...]
+    joint_types: tuple[int, ...]
     rest_state: tuple[float, ...]
     articulation_range: tuple[tuple[float, float], ...]
     rejected_views: int
@@ -155,6 +159,8 @@ def make_shard(task: ShardTask) -> ShardResult:
         samples=len(samples),
         sha256=write_shard(path, arrays),
         instance_id=task.instance_id,
+        part_names=instance.part_names,
+        joint_types=tuple(joint.type for joint in instance.joints),
         rest_state=tuple(rest.tolist()),
         articulation_range=tuple(map(tuple, ((np.array(ranges) - rest[:, None]) / unit[:, None]).tolist())),
         rejected_views=sum(sample.pop("rejected_views", 0) for sample in samples),

@@ -1,0 +1,66 @@
+"""Category specifications: the seven categories of design section 5, and what they demand of an instance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import pi
+
+import numpy as np
+import pytest
+from objects import box_laptop
+
+from render.category import category_names, load_category
+
+# parts, joints, train and test instances of design.md section 5
+CATEGORIES = {
+    "oven": (2, 1, 28, 4),
+    "washing_machine": (2, 1, 36, 5),
+    "eyeglasses": (3, 2, 37, 5),
+    "laptop": (2, 1, 73, 9),
+    "safe": (2, 1, 26, 4),
+    "laptop_real": (2, 1, 44, 6),
+    "drawer": (4, 3, 24, 6),
+}
+
+
+@pytest.mark.parametrize("name", CATEGORIES)
+def test_counts_are_those_of_the_paper(name):
+    spec = load_category(name)
+    assert (len(spec.parts), len(spec.joints), spec.train_instances, spec.test_instances) == CATEGORIES[name]
+    assert set(CATEGORIES) <= set(category_names())
+
+
+def test_unknown_category_names_the_known_ones():
+    with pytest.raises(ValueError, match=r"unknown category 'toaster'.*laptop"):
+        load_category("toaster")
+
+
+def test_laptop_range_is_within_the_limits_of_the_hinge():
+    spec, laptop = load_category("laptop"), box_laptop()
+    np.testing.assert_allclose(np.rad2deg(spec.sampled_ranges(laptop)), [[9, 99]])
+    stiff = replace(laptop, joints=(replace(laptop.joints[0], upper=pi / 4),))
+    np.testing.assert_allclose(np.rad2deg(spec.sampled_ranges(stiff)), [[9, 45]])
+    welded = replace(laptop, joints=(replace(laptop.joints[0], upper=0.1),))
+    with pytest.raises(ValueError, match="'box'.*'hinge'.*exclude the category's range"):
+        spec.sampled_ranges(welded)
+
+
+def test_prismatic_range_is_a_share_of_the_travel():
+    joint = load_category("drawer").joints[0]
+    slide = replace(box_laptop().joints[0], type=1, lower=0.2, upper=0.6)
+    assert joint.coordinate(0.5, slide) == pytest.approx(0.4)
+
+
+def test_to_rest_moves_meshes_to_the_rest_state_of_the_category():
+    closed = box_laptop()
+    rest = load_category("laptop").to_rest(closed)
+    assert rest.joints[0].rest == pytest.approx(pi / 2)
+    base, lid = (mesh.bounds for mesh in rest.meshes)
+    np.testing.assert_allclose(base, closed.meshes[0].bounds)
+    # The lid, 0.02 thick and 0.2 deep, stands upright behind the base.
+    np.testing.assert_allclose(lid[1] - lid[0], [0.3, 0.2, 0.02], atol=1e-12)
+
+
+def test_to_rest_refuses_objects_of_another_category():
+    with pytest.raises(ValueError, match="'box' has parts.*the category has parts"):
+        load_category("oven").to_rest(box_laptop())
