@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from articulate_ssl.prediction import Prediction
-from datamodules.geometry import PRISMATIC, forward_kinematics, screw_motion, transform_points
+from datamodules.geometry import PRISMATIC, forward_kinematics, invert_se3, screw_motion, transform_points
 
 
 def canonical_object(prediction: Prediction) -> Tensor:  # [B, K, M, 3]
@@ -41,6 +41,14 @@ def articulate(
     """
     pose = prediction.base_pose[:, None] @ part_motion(prediction, states)
     return transform_points(pose, canonical_object(prediction))
+
+
+def to_canonical(
+    prediction: Prediction,  # B = 1
+    points: Tensor,  # [..., 3], camera space
+) -> Tensor:  # [..., 3] float64
+    """Points seen from canonical object space: the predicted base pose undone."""
+    return transform_points(invert_se3(prediction.base_pose[0].double()), torch.as_tensor(points).double())
 
 
 def to_input_frame(

@@ -14,16 +14,16 @@ from matplotlib.patheffects import Normal, Stroke
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from articulate_ssl.inference.articulation import articulate, canonical_object, posed_parts
+from articulate_ssl.inference.articulation import articulate, canonical_object, posed_parts, to_canonical
 from articulate_ssl.inference.part_colour import part_colour
+from articulate_ssl.inference.viewpoint import viewing_rotation
 from articulate_ssl.prediction import Prediction
 from datamodules.atomic import atomic_write
-from datamodules.geometry import PRISMATIC, invert_se3, transform_points
+from datamodules.geometry import PRISMATIC
 
 PANEL_INCHES = 2.6
 INK = "#222222"
 LIGHT = np.array([-0.36, 0.6, 0.71])
-AZIMUTH, ELEVATION = np.radians(-32.0), np.radians(24.0)
 
 
 @dataclass(frozen=True)
@@ -74,18 +74,17 @@ def prediction_figure(
     state_range = state_range.to(prediction.joint_state)
     parts = np.repeat(np.arange(prediction.num_parts), prediction.part_shape.shape[2])
     panels = [
-        ("Input, by predicted part", _canonical(prediction, points), part_id),
-        ("Reconstruction", _canonical(prediction, _flat(posed_parts(prediction))), parts),
-        ("Canonical object and joints", _flat(canonical_object(prediction)), parts),
+        ("Input, by predicted part", torch.as_tensor(points), part_id),
+        ("Reconstruction", posed_parts(prediction)[0], parts),
+        ("Canonical object and joints", articulate(prediction, torch.zeros_like(prediction.joint_state))[0], parts),
     ]
     for share in (0.0, 0.5, 1.0) if len(state_range) else ():
         states = torch.lerp(state_range[:, 0], state_range[:, 1], share)
-        moved = _canonical(prediction, _flat(articulate(prediction, states)))
-        panels.append((f"Articulated to {_state_text(prediction, states)}", moved, parts))
+        panels.append((f"Articulated to {_state_text(prediction, states)}", articulate(prediction, states)[0], parts))
 
     view = viewing_rotation(prediction, state_range)
     arrows = [_joint_arrow(prediction, j) @ view.T for j in range(len(state_range))]
-    shapes = [cloud @ view.T for _, cloud, _ in panels]
+    shapes = [_seen(prediction, cloud, view) for _, cloud, _ in panels]
     window = _window([*shapes, *arrows])
     figure, axes = _grid([window], len(panels))
     for ax, (title, _, ids), shape in zip(axes[0], panels, shapes, strict=True):
@@ -101,9 +100,9 @@ def samples_figure(rows: Sequence[SampleRow]) -> Figure:
     shapes, windows = [], []
     for row in rows:
         prediction = row.prediction.to("cpu")
-        view = viewing_rotation(prediction, prediction.joint_state[0, :, None].expand(-1, 2)).T
-        points = _canonical(prediction, row.points) @ view
-        shapes.append((points, points, _canonical(prediction, _flat(posed_parts(prediction))) @ view))
+        view = viewing_rotation(prediction, prediction.joint_state[0, :, None].expand(-1, 2))
+        points = _seen(prediction, torch.as_tensor(row.points), view)
+        shapes.append((points, points, _seen(prediction, posed_parts(prediction)[0], view)))
         windows.append(_window(shapes[-1]))
 
     figure, axes = _grid(windows, 3)
@@ -118,43 +117,6 @@ def samples_figure(rows: Sequence[SampleRow]) -> Figure:
     for ax, text in zip(axes[-1], (heading, "By predicted part", "Reconstruction"), strict=True):
         ax.text(0.5, -0.02, text, transform=ax.transAxes, ha="center", va="top", fontsize=9, color=INK)
     return figure
-
-
-def viewing_rotation(
-    prediction: Prediction,  # B = 1
-    state_range: Tensor,  # [J, 2]
-) -> np.ndarray:  # [3, 3] canonical object space -> (right, up, towards the viewer)
-    """A three-quarter view that shows the object open, whatever frame the training chose as canonical.
-
-    A first joint that turns has its axis across the picture and behind the object; up is where the base is thinnest, on
-    the side of the moving parts in the middle of their range. A first joint that slides comes towards the viewer; up is
-    the direction in which several sliding parts are stacked.
-    """
-    base = _base(prediction)
-    shape = canonical_object(prediction)[0].double().numpy()
-    center = shape[base].mean(axis=0)
-    directions = _principal_directions(shape[base])
-    if not len(state_range):
-        up, back = directions[0], directions[1]
-    elif prediction.joint_type[0, 0] == PRISMATIC:
-        back = -prediction.canonical_axis[0, 0].double().numpy() * (np.sign(state_range[0].mean().item()) or 1.0)
-        sliding = np.delete(shape, base, axis=0).mean(axis=1)
-        stacked = _principal_directions(sliding)[::-1] if len(sliding) > 1 else directions
-        up = next(d for d in (*stacked, *directions) if abs(d @ back) < 0.7)
-    else:
-        axis = prediction.canonical_axis[0, 0].double().numpy()
-        up = next(d for d in directions if abs(d @ axis) < 0.7)
-        middle = articulate(prediction, state_range.to(prediction.joint_state).mean(dim=1))
-        up = up if (_canonical(prediction, _flat(middle)).mean(axis=0) - center) @ up >= 0 else -up
-        back = np.cross(up, axis)
-        back = back if (prediction.canonical_pivot[0, 0].double().numpy() - center) @ back >= 0 else -back
-    back = back - (back @ up) * up
-    back /= np.linalg.norm(back)
-    level = np.stack([np.cross(back, up), back, up])  # x right, y back, z up
-    c, s = np.cos(AZIMUTH), np.sin(AZIMUTH)
-    turned = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ level
-    c, s = np.cos(ELEVATION), np.sin(ELEVATION)
-    return np.array([[1, 0, 0], [0, s, c], [0, -c, s]]) @ turned
 
 
 def _window(shapes: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -180,17 +142,19 @@ def _draw_cloud(
     window: tuple[np.ndarray, np.ndarray],
 ) -> None:
     """Points as lit discs that just close up, far ones first and paler."""
-    brightness = np.ones(len(shape))
+    brightness, spacing = np.ones(len(shape)), np.zeros(len(shape))
     for part in np.unique(part_id):
-        brightness[part_id == part] = _lambert(shape[part_id == part])
+        of_part = part_id == part
+        brightness[of_part], spacing[of_part] = _lambert(shape[of_part])
     depth = (shape[:, 2] - shape[:, 2].min()) / max(np.ptp(shape[:, 2]), 1e-12)
     colour = np.where(part_id[:, None] < 0, 150, part_colour(part_id)) / 255 * brightness[:, None]
     colour = 1 - (0.7 + 0.3 * depth[:, None]) * (1 - colour)
     center, half = window
-    spacing = np.median(cKDTree(shape).query(shape, k=2)[0][:, 1])
-    diameter = np.clip(1.25 * spacing * PANEL_INCHES * 72 / (2 * half[0]), 1.2, 7.0)
+    diameter = np.clip(2.0 * spacing * PANEL_INCHES * 72 / (2 * half[0]), 1.2, 9.0)
     order = np.argsort(shape[:, 2])
-    ax.scatter(*shape[order, :2].T, s=diameter**2, c=colour[order], linewidths=0.2, edgecolors=0.7 * colour[order])
+    ax.scatter(
+        *shape[order, :2].T, s=diameter[order] ** 2, c=colour[order], linewidths=0.2, edgecolors=0.7 * colour[order]
+    )
     ax.set_xlim(center[0] - half[0], center[0] + half[0])
     ax.set_ylim(center[1] - half[1], center[1] + half[1])
     ax.set_aspect("equal")
@@ -199,13 +163,13 @@ def _draw_cloud(
 
 def _lambert(
     shape: np.ndarray,  # [N, 3] one part
-) -> np.ndarray:  # [N] brightness
-    """Light from the upper left behind the viewer on the local planes of the points, both sides alike."""
-    neighbours = shape[cKDTree(shape).query(shape, k=min(16, len(shape)))[1].reshape(len(shape), -1)]
-    spread = neighbours - neighbours.mean(axis=1, keepdims=True)
+) -> tuple[np.ndarray, float]:
+    """Brightness [N] of the points' local planes in light from the upper left, both sides alike; and point spacing."""
+    distance, index = cKDTree(shape).query(shape, k=range(1, min(16, len(shape)) + 1))
+    spread = shape[index] - shape[index].mean(axis=1, keepdims=True)
     normal = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))[1][:, :, 0]
     normal = np.where(normal[:, 2:] < 0, -normal, normal)
-    return 0.68 + 0.32 * np.clip(normal @ LIGHT, 0, 1)
+    return 0.68 + 0.32 * np.clip(normal @ LIGHT, 0, 1), float(np.median(distance[:, -1]) / np.sqrt(len(index[0])))
 
 
 def _draw_arrow(ax: Axes, arrow: np.ndarray) -> None:
@@ -238,22 +202,12 @@ def _state_text(prediction: Prediction, states: Tensor) -> str:
     return ", ".join(texts if len(set(texts)) > 1 else texts[:1]).replace("-", "\N{MINUS SIGN}")
 
 
-def _canonical(prediction: Prediction, points: np.ndarray) -> np.ndarray:
-    pose = invert_se3(prediction.base_pose[0].double())
-    return transform_points(pose, torch.as_tensor(points, dtype=torch.float64)).numpy()
-
-
-def _flat(parts: Tensor) -> np.ndarray:
-    return parts[0].flatten(0, 1).double().numpy()
-
-
-def _principal_directions(points: np.ndarray) -> np.ndarray:
-    """Rows: directions from the least to the largest spread."""
-    return np.linalg.eigh(np.cov(points, rowvar=False))[1].T
-
-
-def _base(prediction: Prediction) -> int:
-    return (set(range(prediction.num_parts)) - set(prediction.joint_child[0].tolist())).pop()
+def _seen(
+    prediction: Prediction,
+    cloud: Tensor,  # [..., 3] camera space
+    view: np.ndarray,  # [3, 3]
+) -> np.ndarray:  # [N, 3] right, up, towards the viewer
+    return to_canonical(prediction, cloud).reshape(-1, 3).numpy() @ view.T
 
 
 def _save(figure: Figure, path: str | os.PathLike) -> None:

@@ -79,9 +79,7 @@ def run(args: argparse.Namespace) -> int:
     summary = json.loads((out / "prediction.json").read_text())
     for table in (_parts_table(summary), _joints_table(summary)):
         Console().print(table)
-    print(
-        f"reconstruction error {summary['reconstruction_error']:.4g}, kinematic error {summary['kinematic_error']:.4g}"
-    )
+    print(f"reconstruction error {summary['reconstruction_error']:.4g} (in the unit of the scan)")
     print("wrote", *files, sep="\n  ")
     return 0
 
