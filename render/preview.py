@@ -120,7 +120,7 @@ def _draw_axes(
     viewpoint: Viewpoint,
 ) -> None:
     """Hinge lines beside the part they move; for sliding joints an arrow from the part's pivot."""
-    reach = 0.3 * instance.rest_diagonal
+    reach = 0.22 * instance.rest_diagonal
     for joint in instance.joints:
         rotation, translation = pose[joint.child, :3, :3], pose[joint.child, :3, 3]
         start = end = joint.pivot
@@ -141,7 +141,7 @@ def _save(figure: Figure, path: Path) -> None:
     """Write a PNG with a palette: a third of the size of true colour."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).quantize(64).save(path, optimize=True)
+    Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).quantize(128).save(path, optimize=True)
 
 
 def main(argv: list[str] | None = None) -> int:

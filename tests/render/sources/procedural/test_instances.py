@@ -17,7 +17,7 @@ INSTANCES = 10
 MAX_FACES = 6000
 MAX_OVERLAP = 1e-4  # shared volume of two parts over the smaller part's volume
 # Independent legs that are both folded cross each other behind the frame, as the paper's states have them.
-MAX_LEG_OVERLAP = 0.2
+MAX_LEG_OVERLAP = 0.12
 
 every_category = pytest.mark.parametrize("category", sorted(GENERATORS))
 
@@ -38,8 +38,9 @@ def between_limits(instance: ArticulatedObject, share: float) -> np.ndarray:
     return np.array([j.lower + share * (j.upper - j.lower) for j in instance.joints])
 
 
-def test_every_category_has_a_generator():
-    assert set(GENERATORS) == set(category_names())
+def test_every_category_of_the_paper_has_a_generator():
+    paper = {"oven", "washing_machine", "eyeglasses", "laptop", "safe", "laptop_real", "drawer"}
+    assert set(GENERATORS) == paper <= set(category_names())
 
 
 @every_category
@@ -54,10 +55,12 @@ def test_parts_are_single_closed_light_solids(category):
 
 
 @every_category
-def test_parts_stay_clear_of_each_other_between_the_joint_limits(category):
+def test_parts_stay_clear_of_each_other_from_closed_to_the_end_of_the_range(category):
+    spec = load_category(category)
     for instance in instances(category):
+        upper = np.array([high for _, high in spec.sampled_ranges(instance)])
         for share in (0.0, 0.05, 0.3, 0.6, 1.0):
-            posed = solids(instance, between_limits(instance, share))
+            posed = solids(instance, share * upper)
             for a, b in combinations(range(instance.num_parts), 2):
                 overlap = (posed[a] ^ posed[b]).volume() / min(posed[a].volume(), posed[b].volume())
                 both_legs = category == "eyeglasses" and a > 0
@@ -84,7 +87,7 @@ def test_hinge_lines_touch_both_parts(category):
                 for part in (joint.parent, joint.child):
                     offset = instance.meshes[part].vertices - joint.pivot
                     distance = np.linalg.norm(np.cross(offset, joint.axis), axis=1).min()
-                    assert distance < 0.02 * instance.rest_diagonal, (instance.name, joint.name, part)
+                    assert distance < 0.03 * instance.rest_diagonal, (instance.name, joint.name, part)
 
 
 # Direction in which the middle of the moving part goes when its joint coordinate grows from closed.
@@ -146,24 +149,20 @@ def test_safes_are_hinged_on_either_side():
         np.testing.assert_allclose(joint.axis, [0, np.sign(joint.pivot[0]), 0])
 
 
-@pytest.mark.parametrize(
-    ("category", "hollow"), [("oven", 0.5), ("washing_machine", 0.9), ("safe", 0.6), ("drawer", 0.4)]
-)
-def test_bodies_have_a_cavity(category, hollow):
+@pytest.mark.parametrize("category", ["oven", "washing_machine", "safe", "drawer"])
+def test_bodies_are_hollow_behind_the_door(category):
     for instance in instances(category):
-        body = instance.meshes[0]
-        assert body.volume < hollow * body.convex_hull.volume, instance.name
+        body, door = instance.meshes[:2]
+        center = np.array([*door.bounds.mean(0)[:2], body.bounds.mean(0)[2]])
+        probe = Manifold.cube(tuple(0.2 * body.extents), center=True).translate(tuple(center))
+        inside = solids(instance, between_limits(instance, 0.0))[0] ^ probe
+        assert inside.volume() < 0.3 * probe.volume(), instance.name
 
 
 def test_drawers_are_open_boxes():
     for instance in instances("drawer"):
         for drawer in instance.meshes[1:]:
-            # Looked into from above, the floor is below the middle of the box.
-            _, y, z = drawer.bounds.mean(0)
-            section = drawer.section(plane_origin=[0, y, z - 0.1], plane_normal=[1, 0, 0])
-            inside = section.vertices[np.abs(section.vertices[:, 2] - (z - 0.1)) < 0.4 * np.ptp(drawer.bounds[:, 2])]
             assert drawer.volume < 0.45 * drawer.convex_hull.volume, instance.name
-            assert len(inside) == 0 or inside[:, 1].min() < y
 
 
 @every_category

@@ -65,7 +65,9 @@ def test_revolve_turns_a_profile_about_the_axis():
 
 def test_loft_through_squares_is_a_closed_prism_facing_outwards():
     square = np.array([(-1.0, -1.0, 0.0), (1.0, -1.0, 0.0), (1.0, 1.0, 0.0), (-1.0, 1.0, 0.0)])
-    mesh = to_trimesh(loft(np.stack([square, square + [0.5, 0, 1], square + [0, 0, 2]])))
+    mesh = to_trimesh(
+        loft(np.stack([square + np.array([shift, 0, z]) for shift, z in ((0.0, 0.0), (0.5, 1.0), (0.0, 2.0))]))
+    )
     assert mesh.is_watertight
     assert mesh.volume == pytest.approx(8.0)
 
