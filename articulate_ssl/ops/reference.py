@@ -23,3 +23,21 @@ def group_convolution(
     grouped = features[sample, index]  # [B, M, n, G, C]
     aggregate = torch.einsum("bmngk,bmngc->bmgkc", rotated, grouped)
     return torch.einsum("bmgkc,kcd->bmgd", aggregate, weight)
+
+
+def chamfer(
+    points: Tensor,  # [*, N, 3]
+    target: Tensor,  # [*, M, 3]
+    squared: bool = False,
+    bidirectional: bool = True,
+    weight: Tensor | None = None,  # [*, N]
+) -> Tensor:  # [*]
+    """Chamfer distance with the whole distance matrix under autograd."""
+    distance = torch.cdist(points, target, compute_mode="donot_use_mm_for_euclid_dist")
+    if squared:
+        distance = distance.square()
+    forward = distance.amin(dim=-1)
+    if weight is None:
+        weight = torch.ones_like(forward)
+    result = (weight * forward).sum(dim=-1) / weight.sum(dim=-1)
+    return result + distance.amin(dim=-2).mean(dim=-1) if bidirectional else result

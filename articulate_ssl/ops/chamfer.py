@@ -1,0 +1,106 @@
+"""Chamfer distance: nearest neighbours without gradient, then the distance to them with gradient.
+
+The gradient of a minimum is that of the entry that attains it, so differentiating the whole distance matrix is wasted.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+_TILE_ELEMENTS = {"cpu": 2**18, "cuda": 2**27}  # entries of a distance matrix held at a time
+_TINY = 1e-12  # squared distances below have zero gradient instead of an infinite one
+
+
+@torch.no_grad()
+def nearest_index(
+    query: Tensor,  # [*, N, 3]
+    target: Tensor,  # [*, M, 3]
+) -> Tensor:  # [*, N] int64
+    """Index of the target point nearest to every query point."""
+    left, right = _factors(query.flatten(0, -3), target.flatten(0, -3))
+    batch, N, _ = left.shape
+    M = right.shape[2]
+    budget = _TILE_ELEMENTS[query.device.type]
+    rows = min(N, max(1, budget // M))
+    problems = min(batch, max(1, budget // (rows * M)))
+    buffer = left.new_empty(problems * rows * M)
+    index = torch.empty(batch, N, dtype=torch.int64, device=query.device)
+    for b in range(0, batch, problems):
+        for i in range(0, N, rows):
+            block = left[b : b + problems, i : i + rows]
+            square = buffer[: block.shape[0] * block.shape[1] * M].view(*block.shape[:2], M)
+            torch.bmm(block, right[b : b + problems], out=square)
+            # Several times faster than argmin on a CPU.
+            index[b : b + problems, i : i + rows] = square.min(dim=-1).indices
+    return index.view(query.shape[:-1])
+
+
+def nearest_squared_distance(
+    query: Tensor,  # [*, N, 3]
+    target: Tensor,  # [*, M, 3]
+) -> Tensor:  # [*, N]
+    """Squared distance of every query point to its nearest target point; differentiable in both."""
+    index = nearest_index(query, target)
+    return (query - target.gather(-2, index[..., None].expand_as(query))).square().sum(dim=-1)
+
+
+def chamfer(
+    points: Tensor,  # [*, N, 3]
+    target: Tensor,  # [*, M, 3]
+    squared: bool = False,
+    bidirectional: bool = True,
+    weight: Tensor | None = None,  # [*, N]
+) -> Tensor:  # [*]
+    """Mean distance of the points to the target, plus with `bidirectional` that of the target to the points.
+
+    Args:
+        squared: squared distances instead of lengths (L1 type).
+        weight: makes the first term a weighted mean over the points.
+    """
+    distance = _length(nearest_squared_distance(points, target), squared)
+    forward = distance.mean(dim=-1) if weight is None else (weight * distance).sum(dim=-1) / weight.sum(dim=-1)
+    if not bidirectional:
+        return forward
+    return forward + _length(nearest_squared_distance(target, points), squared).mean(dim=-1)
+
+
+@torch.no_grad()
+def hypothesis_distances(
+    points: Tensor,  # [B, N, 3]
+    posed: Tensor,  # [B, H, M, 3] one reconstruction per hypothesis
+    squared: bool = False,
+    bidirectional: bool = True,
+) -> Tensor:  # [B, H]
+    """Chamfer distance of every cloud to each of its hypotheses, for choosing among them (no gradient).
+
+    Distances below 1e-3 of the cloud's extent carry float32's cancellation error; see `chamfer` for the exact ones.
+    """
+    B, H, M, _ = posed.shape
+    N = points.shape[1]
+    left, right = _factors(points[:, None].expand(-1, H, -1, -1).flatten(0, 1), posed.flatten(0, 1))
+    problems = min(B * H, max(1, _TILE_ELEMENTS[points.device.type] // (N * M)))
+    buffer = left.new_empty(problems * N * M)
+    result = left.new_empty(B * H)
+    for block in (slice(p, p + problems) for p in range(0, B * H, problems)):
+        square = buffer[: left[block].shape[0] * N * M].view(-1, N, M)
+        torch.bmm(left[block], right[block], out=square)
+        result[block] = _length(square.amin(dim=2), squared).mean(dim=-1)
+        if bidirectional:
+            result[block] += _length(square.amin(dim=1), squared).mean(dim=-1)
+    return result.view(B, H)
+
+
+def _factors(query: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """[b, N, 5] and [b, 5, M] whose product is |x - y|^2, from coordinates about the target's mean."""
+    query, target = query.detach(), target.detach()
+    mean = target.mean(dim=1, keepdim=True)
+    x, y = query - mean, target - mean
+    one = torch.ones_like(x[..., :1]), torch.ones_like(y[..., :1])
+    left = torch.cat([x, x.square().sum(dim=-1, keepdim=True), one[0]], dim=-1)
+    right = torch.cat([-2 * y, one[1], y.square().sum(dim=-1, keepdim=True)], dim=-1)
+    return left, right.transpose(1, 2)
+
+
+def _length(square: Tensor, squared: bool) -> Tensor:
+    return square.clamp(min=0) if squared else square.clamp(min=_TINY).sqrt()
