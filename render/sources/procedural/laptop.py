@@ -13,7 +13,11 @@ from render.sources.procedural.shapes import box, cylinder, extrude, polygon, ro
 
 @dataclass(frozen=True)
 class LaptopParameters:
-    """Sizes in metres. `taper` is the share of the base thickness that is left at the front edge."""
+    """Sizes in metres.
+
+    `taper` is the share of the base thickness that is left at the front edge, `hinge_inset` how far the base reaches
+    behind the hinge, `ports` are side (-1 or 1), distance from the rear and width of the sockets.
+    """
 
     width: float
     depth: float
@@ -33,6 +37,8 @@ class LaptopParameters:
     touchpad_depth: float
     full_width_hinge: bool
     hinge_radius: float
+    hinge_inset: float
+    ports: tuple[tuple[float, float, float], ...]
     foot_strips: bool
     foot_height: float
 
@@ -110,6 +116,13 @@ def _sample(rng, width, depth, base_thickness, lid_share, bezel) -> LaptopParame
         touchpad_depth=depth * rng.uniform(0.24, 0.32),
         full_width_hinge=bool(rng.random() < 0.4),
         hinge_radius=hinge_radius,
+        hinge_inset=depth * rng.uniform(0.03, 0.10) if rng.random() < 0.2 else 0.0,
+        ports=tuple(
+            (side, depth * (0.2 + 0.13 * place), rng.uniform(0.008, 0.016))
+            for side in (-1.0, 1.0)
+            for place in range(4)
+            if rng.random() < 0.6
+        ),
         foot_strips=bool(rng.random() < 0.35),
         foot_height=rng.uniform(0.001, 0.0025),
     )
@@ -118,7 +131,7 @@ def _sample(rng, width, depth, base_thickness, lid_share, bezel) -> LaptopParame
 def build(p: LaptopParameters) -> Design:
     """Base and lid, closed. The hinge line runs along the rear edge, between the two."""
     top, gap = p.base_thickness, 0.0003
-    pivot = np.array([0.0, top + gap + 0.3 * p.hinge_radius, -p.depth / 2 + p.hinge_radius])
+    pivot = np.array([0.0, top + gap + 0.3 * p.hinge_radius, -p.depth / 2 + p.hinge_radius + p.hinge_inset])
     barrels = _barrel_ranges(p)
     return Design(
         parts={"base": _base(p, pivot, barrels), "lid": _lid(p, pivot, barrels, top + gap)},
@@ -155,8 +168,19 @@ def _base(p: LaptopParameters, pivot: np.ndarray, barrels: list[tuple[float, flo
             (-p.touchpad_width / 2, top - 0.0007, pad_back), (p.touchpad_width / 2, top + 1e-3, pad_front), "y", 0.003
         )
     )
+    cuts += _sockets(p)
     keys = _keys(p, keyboard_back, keyboard_front, top - recess - 1e-4, top - 0.0003)
     return union([subtract(body, cuts), *keys, *_feet(p)])
+
+
+def _sockets(p: LaptopParameters) -> list[Manifold]:
+    y, half_height, reach = 0.62 * p.base_thickness, min(0.0025, 0.16 * p.base_thickness), 0.004
+    sockets = []
+    for side, rear, width in p.ports:
+        x, z = side * p.width / 2, rear - p.depth / 2
+        low, high = (x - reach, y - half_height, z), (x + reach, y + half_height, z + width)
+        sockets.append(rounded_box(low, high, "x", 0.8 * half_height, segments=8))
+    return sockets
 
 
 def _keys(p: LaptopParameters, back: float, front: float, low: float, high: float) -> list[Manifold]:
