@@ -11,7 +11,7 @@ from articulate_ssl.metrics.calibration import (
     Calibration,
     check_labels,
     dense_prediction,
-    gather_joints,
+    gather_rows,
     match_joints,
     predicts_joints,
 )
@@ -50,7 +50,7 @@ def part_pose_errors(
     A part's translation is the position of its bounding-box centre (the paper centralises bounding boxes): the slot's
     pose applied to the residual centre of training, against the true pose applied to the true centre.
     """
-    pose = gather_joints(prediction.part_pose, slot)
+    pose = gather_rows(prediction.part_pose, slot)
     residual = calibration.part_of_slot[slot]  # residuals belong to slots, whatever part a slot is compared with
     target = labels["part_pose"].double()
     rotation = rotation_error(pose[..., :3, :3] @ calibration.residual_rotation[residual], target[..., :3, :3])
@@ -77,9 +77,9 @@ def joint_errors(
         calibration.joint_child,
         calibration.network_joint,
     )
-    axis, pivot = gather_joints(prediction.joint_axis, joint), gather_joints(prediction.joint_pivot, joint)
+    axis, pivot = gather_rows(prediction.joint_axis, joint), gather_rows(prediction.joint_pivot, joint)
     revolute = (calibration.joint_type == REVOLUTE).expand(joint.shape)
-    state = calibration.state_sign * orientation * gather_joints(prediction.joint_state, joint)
+    state = calibration.state_sign * orientation * gather_rows(prediction.joint_state, joint)
     state_err = state_error(state + calibration.state_offset, labels["joint_state"].double(), revolute)
     line_err = line_to_line_distance(axis, pivot, target_axis, target_pivot)
     legacy_pivot = legacy_pivot_error(pivot, target_axis, target_pivot, labels["points"].double().mean(1))

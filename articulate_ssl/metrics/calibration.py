@@ -164,12 +164,12 @@ def match_joints(
     return joint, orientation
 
 
-def gather_joints(
-    values: Tensor,  # [B, J, ...]
-    joint: Tensor,  # [B, J]
-) -> Tensor:  # [B, J, ...] float64
-    """Per-joint values in the order of `joint`."""
-    return values.double()[torch.arange(len(joint), device=joint.device)[:, None], joint]
+def gather_rows(
+    values: Tensor,  # [B, M, ...]
+    index: Tensor,  # [B, L]
+) -> Tensor:  # [B, L, ...] float64
+    """Every cloud's parts or joints in its own order."""
+    return values.double()[torch.arange(len(index), device=index.device)[:, None], index]
 
 
 def calibrate(
@@ -210,28 +210,41 @@ def calibrate(
         for k in range(num_parts)
     ]
 
-    joint_parent, joint_child, joint_type = (labels[f"joint_{n}"][0].long() for n in ("parent", "child", "type"))
-    joint, orientation = match_joints(predictions, slot_of_part.argsort(), joint_parent, joint_child)
-    state_sign, state_offset = fit_states(
-        gather_joints(predictions.joint_state, joint) * orientation,
-        labels["joint_state"].double(),
-        joint_type == REVOLUTE,
-    )
-    along = (gather_joints(predictions.joint_axis, joint) * labels["joint_axis"].double()).sum(-1)  # [S, J]
     return Calibration(
         slot_of_part=slot_of_part,
         residual_rotation=torch.stack([r for r, _ in rotations]),
         residual_center=torch.stack([c for c, _ in centers]),
-        joint_parent=joint_parent,
-        joint_child=joint_child,
-        joint_type=joint_type,
-        network_joint=joint.mode(dim=0).values,
-        state_sign=state_sign,
-        state_offset=state_offset,
-        axis_sign=torch.where(along.sum(0) < 0, -1.0, 1.0).double(),
+        **calibrate_joints(predictions, labels, slot_of_part.argsort()),
         rotation_inliers=torch.stack([share for _, share in rotations]),
         center_inliers=torch.stack([share for _, share in centers]),
     )
+
+
+def calibrate_joints(
+    predictions: Prediction,
+    labels: dict[str, Tensor],
+    part_of_slot: Tensor,  # [K]
+) -> dict[str, Tensor]:
+    """The fields of `Calibration` about joints; signs 1 and offsets 0 for a method that predicts none."""
+    parent, child, joint_type = (labels[f"joint_{name}"][0].long() for name in ("parent", "child", "type"))
+    fixed = {"joint_parent": parent, "joint_child": child, "joint_type": joint_type}
+    if not predicts_joints(predictions):
+        one = torch.ones_like(parent, dtype=torch.float64)
+        order = torch.arange(len(parent), device=parent.device)
+        return fixed | {"network_joint": order, "state_sign": one, "state_offset": 0 * one, "axis_sign": one}
+    joint, orientation = match_joints(predictions, part_of_slot, parent, child)
+    state_sign, state_offset = fit_states(
+        gather_rows(predictions.joint_state, joint) * orientation,
+        labels["joint_state"].double(),
+        joint_type == REVOLUTE,
+    )
+    along = (gather_rows(predictions.joint_axis, joint) * labels["joint_axis"].double()).sum(-1)  # [S, J]
+    return fixed | {
+        "network_joint": joint.mode(dim=0).values,
+        "state_sign": state_sign,
+        "state_offset": state_offset,
+        "axis_sign": torch.where(along.sum(0) < 0, -1.0, 1.0).double(),
+    }
 
 
 def fit_states(

@@ -138,7 +138,7 @@ def part_iou(
 
 
 def best_assignment(
-    score: Tensor,  # [R, C], larger is better
+    score: Tensor,  # [C, C], larger is better
 ) -> Tensor:  # [C] int64, the row assigned to every column
     """Hungarian assignment of rows to columns (NaN counts as zero)."""
     row, column = linear_sum_assignment(score.nan_to_num().cpu().numpy(), maximize=True)

@@ -186,10 +186,12 @@ def test_a_method_without_joints_gets_no_joint_errors():
     labels = articulated_labels(num_parts=3)
     truth = perfect_oracle(labels)
     names = [n for n in vars(truth) if n.startswith(("joint_", "canonical_"))]
-    result = score(replace(truth, **{n: getattr(truth, n)[:, :0] for n in names}), labels, truth, labels)
-    for name in PER_JOINT:
-        assert [result[name]["mean"], *(j["mean"] for j in result[name]["joints"])] == [None] * 3
-    assert result["r_err_deg"]["mean"] < 1e-3
+    jointless = replace(truth, **{n: getattr(truth, n)[:, :0] for n in names})
+    for train in (truth, jointless):
+        result = score(jointless, labels, train, labels)
+        for name in PER_JOINT:
+            assert [result[name]["mean"], *(j["mean"] for j in result[name]["joints"])] == [None] * 3
+        assert result["r_err_deg"]["mean"] < 1e-3
 
 
 def test_joint_listing_may_vary_between_clouds():
@@ -286,6 +288,15 @@ def test_two_ranks_with_unequal_shares_equal_one_process(tmp_path):
     metrics.update(noisy, labels)
     for rank in range(2):
         assert_same(metrics.compute(), torch.load(tmp_path / f"rank{rank}.pt", weights_only=True))
+
+
+def test_a_mixed_precision_prediction_is_scored():
+    labels = articulated_labels(num_parts=2)
+    truth = perfect_oracle(labels)
+    half = replace(truth, part_shape=truth.part_shape.bfloat16(), joint_state=truth.joint_state.bfloat16())
+    result = score(half, labels)
+    assert result["chamfer_l1"]["mean"] < 1e-3
+    assert result["r_err_deg"]["mean"] < 1e-3
 
 
 def test_metrics_do_not_depend_on_the_frame_of_the_camera():
