@@ -48,7 +48,7 @@ def to_canonical(
     points: Tensor,  # [..., 3], camera space
 ) -> Tensor:  # [..., 3] float64
     """Points seen from canonical object space: the predicted base pose undone."""
-    return transform_points(invert_se3(prediction.base_pose[0].double()), torch.as_tensor(points).double())
+    return transform_points(invert_se3(prediction.base_pose[0].double()), points.double())
 
 
 def to_input_frame(

@@ -1,18 +1,15 @@
 import matplotlib.image
 import numpy as np
-import pytest
 import synthetic_predictions as synthetic
 import torch
 
 from articulate_ssl.inference.articulation import to_input_frame
-from articulate_ssl.inference.part_colour import PALETTE, part_colour
 from articulate_ssl.inference.picture import (
     SampleRow,
     draw_prediction,
     draw_test_samples,
     prediction_figure,
     samples_figure,
-    viewing_rotation,
 )
 from articulate_ssl.prediction import Prediction
 from datamodules.geometry import se3
@@ -80,32 +77,6 @@ def test_the_picture_does_not_depend_on_the_pose_and_unit_of_the_scan():
         np.testing.assert_allclose(discs(b), 2 * discs(a), atol=1e-5)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_the_view_follows_the_object_not_the_canonical_frame(seed):
-    prediction, _ = synthetic.laptop()
-    view = viewing_rotation(prediction, RANGE)
-    turn = synthetic.random_rotation(seed + 20)
-    turned = Prediction(
-        **{
-            **vars(prediction),
-            "part_shape": prediction.part_shape @ turn.T,
-            "assembly": prediction.assembly @ turn.T,
-            "canonical_axis": prediction.canonical_axis @ turn.T,
-            "canonical_pivot": prediction.canonical_pivot @ turn.T,
-            "base_pose": prediction.base_pose @ se3(turn.T, torch.zeros(3)),
-        }
-    )
-    np.testing.assert_allclose(viewing_rotation(turned, RANGE) @ turn.numpy(), view, atol=1e-3)
-
-
-@pytest.mark.parametrize(("make", "limits"), [(synthetic.laptop, RANGE), (synthetic.drawer, SLIDE)])
-def test_the_view_is_a_rotation_that_shows_the_object_upright(make, limits):
-    view = viewing_rotation(make()[0], limits)
-    np.testing.assert_allclose(view @ view.T, np.eye(3), atol=1e-6)
-    assert np.linalg.det(view) == pytest.approx(1)
-    assert abs(view[1, 2]) > 0.85  # the canonical z of both objects is vertical in the picture
-
-
 def test_degenerate_predictions_are_drawn():
     for make, limits in ((synthetic.laptop, RANGE), (synthetic.drawer, SLIDE)):
         prediction, points = make()
@@ -142,8 +113,3 @@ def test_sample_rows_are_titled_and_grey_without_truth():
     assert [ax.get_title(loc="left") for ax in figure.axes[::3]] == ["best: 1°", "median: 3°", "worst: 170°"]
     truth, predicted = (np.asarray(figure.axes[i].collections[0].get_facecolors())[:, :3] for i in (0, 1))
     assert np.ptp(truth, axis=1).max() < 1e-6 < np.ptp(predicted, axis=1).min()
-
-
-def test_part_colours_are_distinct_and_start_again():
-    assert len(np.unique(PALETTE, axis=0)) == len(PALETTE)
-    assert (part_colour(np.arange(2 * len(PALETTE))) == np.tile(PALETTE, (2, 1))).all()
