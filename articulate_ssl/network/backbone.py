@@ -15,14 +15,39 @@ from articulate_ssl.ops.kernel_points import KernelPoints, symmetric_kernel_poin
 from articulate_ssl.ops.neighborhood import Neighborhood, correlate, nearest_neighbors
 
 
-class GroupConvolutionBlock(nn.Module):
-    """Group convolution -> normalisation -> LeakyReLU.
+class IntraGroupConvolution(nn.Module):
+    """Convolution over the rotation group by right multiplication: sum over h in H of F(x, g h) V_h (EPN).
 
+    Right multiplication commutes with the left action. H holds the identity and the 11 elements of smallest angle.
+    """
+
+    def __init__(self, in_channels: int, out_channels: int, group: RotationGroup, num_elements: int = 12) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.empty(num_elements, in_channels, out_channels))
+        nn.init.normal_(self.weight, std=2 / (in_channels * num_elements + out_channels) ** 0.5)
+        self.register_buffer("neighbor", group.product[:, :num_elements].T.contiguous(), persistent=False)
+
+    def forward(
+        self,
+        features: Tensor,  # [B, M, G, C]
+    ) -> Tensor:  # [B, M, G, C']
+        # Projected before it is permuted: autograd then keeps one copy of the features instead of one per element.
+        return sum(
+            (features @ weight).index_select(2, index) for weight, index in zip(self.weight, self.neighbor, strict=True)
+        )
+
+
+class GroupConvolutionBlock(nn.Module):
+    """Group convolution -> normalisation -> LeakyReLU; with `intra`, EPN's separable block.
+
+    The separable block adds an intra-group convolution and a skip connection, each with normalisation and LeakyReLU.
     Layer normalisation over the channels of each point and group element commutes with the action of the group and
     mixes neither points nor samples, so a cloud's features do not depend on the rest of its batch.
     """
 
-    def __init__(self, in_channels: int, out_channels: int, kernel: KernelPoints) -> None:
+    def __init__(
+        self, in_channels: int, out_channels: int, group: RotationGroup, kernel: KernelPoints, intra: bool
+    ) -> None:
         super().__init__()
         num_points = len(kernel.points)
         self.weight = nn.Parameter(torch.empty(num_points, in_channels, out_channels))
@@ -30,14 +55,25 @@ class GroupConvolutionBlock(nn.Module):
         nn.init.normal_(self.weight, std=2 / (in_channels * num_points + out_channels) ** 0.5)
         self.norm = nn.LayerNorm(out_channels)
         self.register_buffer("permutation", kernel.permutation, persistent=False)
+        self.intra = self.skip = None
+        if intra:
+            self.intra = nn.Sequential(
+                IntraGroupConvolution(out_channels, out_channels, group), nn.LayerNorm(out_channels), nn.LeakyReLU()
+            )
+            self.skip = nn.Sequential(nn.Linear(in_channels, out_channels), nn.LayerNorm(out_channels), nn.LeakyReLU())
 
     def forward(
         self,
         features: Tensor | None,  # [B, N, G, C], or None for the constant one
-        neighborhood: Neighborhood,
+        neighborhood: Neighborhood,  # its M centres are the leading points
     ) -> Tensor:  # [B, M, G, C']
-        features = group_convolution(features, neighborhood, self.weight, self.permutation)
-        return leaky_relu(self.norm(features), negative_slope=0.01)
+        out = group_convolution(features, neighborhood, self.weight, self.permutation)
+        out = leaky_relu(self.norm(out), negative_slope=0.01)
+        if self.intra is None:
+            return out
+        B, M, G, _ = out.shape
+        center = out.new_ones(B, M, G, 1) if features is None else features[:, :M]
+        return self.intra(out) + self.skip(center)
 
 
 class EquivariantBackbone(nn.Module):
@@ -51,6 +87,10 @@ class EquivariantBackbone(nn.Module):
         num_kernel_points: see `symmetric_kernel_points`.
         num_centers: for each layer, how many leading points remain (points come in farthest-point order, so a prefix
             covers the cloud); None keeps all of them everywhere.
+        intra: let the group's elements communicate in every layer (EPN's separable block).
+
+    Raises:
+        ValueError: if `dims`, `radii` and `num_centers` differ in length.
     """
 
     group: RotationGroup
@@ -63,6 +103,7 @@ class EquivariantBackbone(nn.Module):
         num_neighbors: int = 64,
         num_kernel_points: int = 24,
         num_centers: Sequence[int] | None = None,
+        intra: bool = False,
     ) -> None:
         super().__init__()
         if len(radii) != len(dims) or (num_centers is not None and len(num_centers) != len(dims)):
@@ -77,7 +118,8 @@ class EquivariantBackbone(nn.Module):
         kernel = symmetric_kernel_points(self.group, num_kernel_points)
         self.register_buffer("kernel_points", kernel.points, persistent=False)
         self.blocks = nn.ModuleList(
-            GroupConvolutionBlock(c_in, c_out, kernel) for c_in, c_out in zip((1, *dims[:-1]), dims, strict=True)
+            GroupConvolutionBlock(c_in, c_out, self.group, kernel, intra)
+            for c_in, c_out in zip((1, *dims[:-1]), dims, strict=True)
         )
 
     def neighborhoods(

@@ -5,7 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from articulate_ssl.ops.neighborhood import Neighborhood
+from articulate_ssl.groups import RotationGroup
+from articulate_ssl.ops.kernel_points import KernelPoints
+from articulate_ssl.ops.neighborhood import INFLUENCE, KERNEL_RADIUS, Neighborhood
+from datamodules.geometry import invert_se3, transform_points
 
 
 def group_convolution(
@@ -41,3 +44,41 @@ def chamfer(
         weight = torch.ones_like(forward)
     result = (weight * forward).sum(dim=-1) / weight.sum(dim=-1)
     return result + distance.amin(dim=-2).mean(dim=-1) if bidirectional else result
+
+
+def pose_aware_convolution(
+    features: Tensor,  # [B, N, G, C] camera frame
+    points: Tensor,  # [B, N, 3]
+    poses: Tensor,  # [B, N, 4, 4]
+    weight: Tensor,  # [K, C, C']
+    group: RotationGroup,
+    kernel: KernelPoints,
+    radius: float,
+    num_neighbors: int,
+) -> Tensor:  # [B, N, G, C'] camera frame
+    """Paper Eq. 2 neighbour by neighbour, as the original: every pair aligned, matched with the group, and correlated.
+
+    With identity poses this is what the original runs for each layer of its backbone.
+    """
+    B, N = points.shape[:2]
+    sigma = INFLUENCE * radius**2
+    elements = group.elements.to(points)
+    rotation = poses[..., :3, :3]
+    with torch.no_grad():
+        canonical = transform_points(invert_se3(poses), points[..., None, :]).squeeze(-2)
+        distance, index = torch.cdist(canonical, canonical, compute_mode="donot_use_mm_for_euclid_dist").topk(
+            min(num_neighbors, N), dim=-1, largest=False
+        )
+        sample = torch.arange(B, device=points.device)[:, None, None]
+        aligned = poses[:, :, None] @ invert_se3(poses)[sample, index]  # [B, N, n, 4, 4] P_i P_j^{-1}
+        offset = transform_points(aligned, points[sample, index][..., None, :]).squeeze(-2) - points[:, :, None]
+        relative = rotation[sample, index] @ rotation[:, :, None].transpose(-1, -2)  # R_j R_i^{-1}
+        match = group.nearest(relative[..., None, :, :] @ elements)  # [B, N, n, G]
+        rotated = torch.einsum("gxy,ky->gkx", elements, KERNEL_RADIUS * radius * kernel.points.to(points))
+        square = (offset[:, :, :, None, None] - rotated).square().sum(dim=-1)  # [B, N, n, G, K]
+        inside = (distance <= radius).to(points)
+        share = inside / inside.sum(dim=-1, keepdim=True)
+        correlation = (1 - square / sigma).clamp(min=0) * share[..., None, None]
+    grouped = features[sample[..., None], index[..., None], match]  # [B, N, n, G, C]
+    aggregate = torch.einsum("bmngk,bmngc->bmgkc", correlation, grouped)
+    return torch.einsum("bmgkc,kcd->bmgd", aggregate, weight)

@@ -1,0 +1,79 @@
+"""The backbone is equivariant, and treats every cloud and every order of points alike."""
+
+import pytest
+import torch
+
+from articulate_ssl.equivariance import Permutation, Vector, assert_equivariant, off_group_residual
+from articulate_ssl.network.backbone import EquivariantBackbone
+
+
+def _backbone(**options):
+    torch.manual_seed(0)
+    return EquivariantBackbone(
+        **{"group_order": 12, "dims": (4, 6), "radii": (0.2, 0.3), "num_neighbors": 10} | options
+    )
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("intra", [False, True])
+@pytest.mark.parametrize("group_order", [12, 24, 60])
+def test_rotations_of_the_cloud_permute_the_group(group_order, intra, dtype):
+    backbone = _backbone(group_order=group_order, intra=intra, num_centers=(30, 20)).to(dtype)
+    points = 0.5 * torch.rand(1, 40, 3, dtype=dtype)
+    with torch.no_grad():
+        assert_equivariant(backbone, (points,), backbone.group, [Vector()], Permutation())
+
+
+def test_translation_changes_nothing():
+    backbone = _backbone().double()
+    points = 0.5 * torch.rand(2, 40, 3, dtype=torch.float64)
+    torch.testing.assert_close(backbone(points + 5), backbone(points), rtol=1e-9, atol=1e-9)
+
+
+def test_the_order_of_points_does_not_matter():
+    backbone = _backbone().double()
+    points = 0.5 * torch.rand(2, 40, 3, dtype=torch.float64)
+    order = torch.randperm(40)
+    torch.testing.assert_close(backbone(points[:, order]), backbone(points)[:, order])
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_a_cloud_does_not_depend_on_the_rest_of_its_batch(training):
+    backbone = _backbone(intra=True).double().train(training)
+    points = 0.5 * torch.rand(3, 40, 3, dtype=torch.float64)
+    alone = torch.cat([backbone(cloud[None]) for cloud in points])
+    torch.testing.assert_close(backbone(points), alone, rtol=1e-12, atol=1e-12)
+
+
+def test_centres_are_the_leading_points():
+    backbone = _backbone(num_centers=(30, 20))
+    points = 0.5 * torch.rand(2, 40, 3)
+    assert backbone(points).shape == (2, 20, 12, 6)
+    # The last layer's centres see the 30 points that the first kept.
+    moved = points.clone()
+    moved[:, 30:] += 10
+    first = _backbone(num_centers=(30, 20))
+    assert not torch.equal(first(moved), backbone(points))
+    assert backbone(points[:, :15]).shape == (2, 15, 12, 6)
+
+
+def test_every_parameter_gets_a_gradient():
+    backbone = _backbone(intra=True)
+    backbone(0.5 * torch.rand(2, 40, 3)).square().sum().backward()
+    for name, parameter in backbone.named_parameters():
+        assert parameter.grad.abs().max() > 0, name
+
+
+def test_layers_state_one_value_each():
+    with pytest.raises(ValueError, match="one value per layer"):
+        EquivariantBackbone(12, (4, 6), (0.2,))
+
+
+def test_between_group_elements_the_residual_shrinks_with_the_group():
+    points = 0.5 * torch.rand(4, 60, 3, dtype=torch.float64)
+    residual = {
+        order: off_group_residual(backbone, points, backbone.group)
+        for order in (12, 60)
+        for backbone in [_backbone(group_order=order).double().requires_grad_(False)]
+    }
+    assert 0 < residual[60] < residual[12]
