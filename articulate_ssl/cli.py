@@ -1,0 +1,92 @@
+"""The command line: `lightning fit|validate|test -c configs/<category>.yaml`, and `lightning predict CLOUD --ckpt …`.
+
+Both console scripts, `lightning` and `articulate-ssl`, are this program.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a command and return its exit code: 0, or 2 for bad arguments or bad input (one message, no traceback)."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    if arguments[:1] == ["predict"]:
+        return _predict(arguments[1:])
+    return _learn(arguments)
+
+
+def _predict(arguments: list[str]) -> int:
+    import argparse
+
+    from articulate_ssl.inference import predict_command
+
+    parser = argparse.ArgumentParser(
+        prog="lightning predict", description="Parts, poses and joints of the object in one scan."
+    )
+    predict_command.add_arguments(parser)
+    return predict_command.run(parser.parse_args(arguments))
+
+
+def _learn(arguments: list[str]) -> int:
+    import warnings
+
+    import torch
+    from lightning.pytorch.cli import LightningCLI
+
+    from articulate_ssl.inference.checkpoint_file import CheckpointError, read_checkpoint
+    from articulate_ssl.module import ArticulatedPoseModule
+    from datamodules.articulated_data_module import ArticulatedDataModule
+    from datamodules.manifest import ManifestError
+    from datamodules.shards import ShardError
+
+    warnings.filterwarnings("ignore", ".*isinstance.treespec, LeafSpec.*")
+    warnings.filterwarnings("ignore", ".*does not have many workers.*")
+    torch.set_float32_matmul_precision("high")
+
+    class ArticulateCLI(LightningCLI):
+        def add_arguments_to_parser(self, parser) -> None:
+            parser.link_arguments("data.category", "model.category")
+
+        def _use_checkpoint(self, subcommand: str) -> None:
+            """Only trained weights of this category are scored: a bare `lightning test` would score random ones."""
+            options = self.config_init[subcommand]
+            if options.get("ckpt_path") is None:
+                folder = Path(self.trainer.default_root_dir)
+                found = sorted(folder.glob("**/last.ckpt"), key=lambda p: p.stat().st_mtime)
+                if not found:
+                    raise CheckpointError(
+                        f"lightning {subcommand}: no checkpoint under {folder}; run `lightning fit -c …` first, or pass --ckpt_path"
+                    )
+                options["ckpt_path"] = str(found[-1])
+            path = options["ckpt_path"]
+            trained_on = read_checkpoint(path)["hyper_parameters"].get("category")
+            if trained_on != self.model.category:
+                raise CheckpointError(
+                    f"{path}: trained on category {trained_on!r}, but the data are {self.model.category!r}; "
+                    f"use configs/{trained_on}.yaml or another checkpoint"
+                )
+
+        def before_test(self) -> None:
+            self._use_checkpoint("test")
+
+        def before_validate(self) -> None:
+            self._use_checkpoint("validate")
+
+    try:
+        ArticulateCLI(
+            ArticulatedPoseModule,
+            ArticulatedDataModule,
+            args=arguments,
+            seed_everything_default=0,
+            save_config_kwargs={"overwrite": True},
+        )
+    except (CheckpointError, ManifestError, ShardError) as error:
+        print(f"lightning: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Self-supervised objectives: reconstruction (min over the group) and joint regularization."""

@@ -1,0 +1,500 @@
+"""The LightningModule: training by either recipe, honest testing, and prediction."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import roma
+import torch
+from lightning.pytorch import LightningModule
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+from articulate_ssl.groups import rotation_group
+from articulate_ssl.inference.checkpoint_file import CHECKPOINT_KEY
+from articulate_ssl.inference.point_cloud_io import farthest_point_order, normalise_cloud
+from articulate_ssl.inference.test_report import TestReport
+from articulate_ssl.losses.reconstruction import distances_to_parts
+from articulate_ssl.network.articulated_network import ArticulatedNetwork, Hypotheses
+from articulate_ssl.network.backbone import EquivariantBackbone
+from articulate_ssl.network.rigid_alignment import RigidAlignment
+from articulate_ssl.ops.chamfer import chamfer, hypothesis_distances
+from articulate_ssl.options import (
+    RECIPES,
+    DiscoveryOptions,
+    InferenceOptions,
+    NetworkOptions,
+    ObjectiveOptions,
+    ScheduleOptions,
+)
+from articulate_ssl.prediction import Prediction
+from articulate_ssl.recipes.objective import PoseTarget, Terms, paper_terms, staged_terms, winning_hypothesis
+from articulate_ssl.recipes.part_discovery import ArticulatedTemplate, discover
+from articulate_ssl.registration import JointModel, LabelledTemplate, register_articulated
+from datamodules.articulated_dataset import split_labels
+from datamodules.geometry import PRISMATIC, REVOLUTE, invert_se3, se3, transform_points
+
+JOINT_TYPES = {"revolute": REVOLUTE, "prismatic": PRISMATIC}
+SCALE_STARTS = (-1.5, -0.75, 0.0, 0.75, 1.5)
+
+
+class ArticulatedPoseModule(LightningModule):
+    """Self-supervised category-level articulated object pose estimation.
+
+    Args:
+        category: Category name, kept in checkpoints.
+        num_parts: K.
+        joint_type: `revolute` or `prismatic`.
+        state_range: Width of the category's articulation range: radians, or normalised length.
+        recipe: `staged` (part discovery by registration, then the network) or `paper` (its objective and nothing else).
+        network: Sizes of the networks.
+        objective: Loss weights.
+        schedule: Steps and learning rates.
+        discovery: Effort of part discovery (staged recipe).
+        inference: Refinement at test time.
+        calibration_samples: Training clouds on which `lightning test` relates slots and canonical spaces to labels.
+
+    Raises:
+        ValueError: for an unknown recipe or joint type.
+    """
+
+    def __init__(
+        self,
+        category: str,
+        num_parts: int,
+        joint_type: str = "revolute",
+        state_range: float = math.pi / 2,
+        recipe: str = "staged",
+        network: NetworkOptions = NetworkOptions(),  # noqa: B008 frozen
+        objective: ObjectiveOptions = ObjectiveOptions(),  # noqa: B008
+        schedule: ScheduleOptions = ScheduleOptions(),  # noqa: B008
+        discovery: DiscoveryOptions = DiscoveryOptions(),  # noqa: B008
+        inference: InferenceOptions = InferenceOptions(),  # noqa: B008
+        calibration_samples: int = 128,
+    ) -> None:
+        super().__init__()
+        if recipe not in RECIPES:
+            raise ValueError(f"recipe must be one of {RECIPES}, got {recipe!r}")
+        if joint_type not in JOINT_TYPES:
+            raise ValueError(f"joint_type must be one of {sorted(JOINT_TYPES)}, got {joint_type!r}")
+        if num_parts < 2:
+            raise ValueError(f"num_parts must be at least 2, got {num_parts}")
+        groups = {"network": network, "objective": objective, "schedule": schedule}
+        groups |= {"discovery": discovery, "inference": inference}
+        plain = {"category": category, "num_parts": num_parts, "joint_type": joint_type, "state_range": state_range}
+        plain |= {"recipe": recipe, "calibration_samples": calibration_samples}
+        self.save_hyperparameters(plain | {name: asdict(value) for name, value in groups.items()}, logger=False)
+        self.category, self.num_parts, self.recipe = category, num_parts, recipe
+        self.network_options, self.objective, self.schedule = network, objective, schedule
+        self.discovery, self.inference, self.calibration_samples = discovery, inference, calibration_samples
+
+        group = rotation_group(network.group_order)
+        self.group = group
+        self.articulated = ArticulatedNetwork(
+            self._backbone(),
+            group,
+            network.dims[-1],
+            network.head_dim,
+            num_parts,
+            network.shape_points,
+            JOINT_TYPES[joint_type],
+            state_bound=state_range,
+            flow_bound=network.flow_bound,
+            stretch_bound=network.stretch_bound,
+            part_features=network.part_features,
+            shared_axis=network.shared_axis,
+        )
+        self.rigid = (
+            RigidAlignment(self._backbone(), group, network.dims[-1], network.head_dim, num_parts * network.shape_points)
+            if schedule.rigid_steps
+            else None
+        )
+        # Mean distance of a cloud's points to their centre, over training clouds: how a scan of unknown scale is scaled.
+        self.register_buffer("radius_mean", torch.tensor(0.0))
+        self.register_buffer("radius_square", torch.tensor(0.0))
+        self.register_buffer("state_limits", torch.zeros(num_parts - 1, 2))
+        self.registered: dict[str, Tensor] | None = None
+
+    def _backbone(self) -> EquivariantBackbone:
+        n = self.network_options
+        return EquivariantBackbone(
+            n.group_order, n.dims, n.radii, n.num_neighbors, n.num_kernel_points, n.num_centers
+        )
+
+    # Pose estimation
+
+    def align(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Stage 0: clouds turned roughly to canonical orientation [B, N, 3], and the pose [B, 4, 4] that undoes it."""
+        if self.rigid is None:
+            return points, torch.eye(4, device=points.device).expand(len(points), 4, 4)
+        with torch.no_grad():
+            hypotheses = self.rigid(points)
+            best = hypothesis_distances(points, hypotheses.posed()).argmin(dim=1)
+            rows = torch.arange(len(points), device=points.device)
+            pose = se3(hypotheses.rotation[rows, best], hypotheses.translation[rows, best])
+        return transform_points(invert_se3(pose), points), pose
+
+    def part_labels(self, hypothesis: Hypotheses, points: Tensor) -> Tensor:
+        """[B, N] part of every point: the posed part of a single hypothesis that lies nearest."""
+        return distances_to_parts(points, hypothesis.posed()[:, 0]).argmin(dim=-1)
+
+    def iterate(self, points: Tensor) -> list[Hypotheses]:
+        """Hypotheses of every iteration for aligned clouds; each starts from the winner of the one before."""
+        results, estimate, labels = [], None, None
+        for _ in range(self.network_options.iterations):
+            hypotheses = self.articulated(points, estimate, labels)
+            results.append(hypotheses)
+            if self.network_options.pose_aware:
+                winner, _ = winning_hypothesis(hypotheses, points, self.objective.unidirectional)
+                estimate = hypotheses.select(winner)
+                labels = self.part_labels(estimate, points)
+        return results
+
+    @torch.no_grad()
+    def predict_points(self, points: Tensor, refine: bool | None = None) -> Prediction:
+        """Predictions for normalised clouds [B, N, 3]; one cloud's does not depend on the rest of the batch.
+
+        Raises:
+            ValueError: if a cloud has NaN or infinite points.
+        """
+        if not torch.isfinite(points).all():
+            raise ValueError("a cloud has NaN or infinite points")
+        aligned, pose = self.align(points)
+        hypotheses = self.iterate(aligned)[-1]
+        distance = hypothesis_distances(
+            aligned, hypotheses.posed().flatten(2, 3), bidirectional=not self.objective.unidirectional
+        )
+        if self.inference.refine if refine is None else refine:
+            chosen = self._refine(hypotheses, aligned, distance)
+        else:
+            chosen = hypotheses.select(distance.argmin(dim=1))
+        return self._prediction(chosen.at(pose[:, None] @ chosen.base, chosen.state), points)
+
+    def _refine(self, hypotheses: Hypotheses, points: Tensor, distance: Tensor) -> Hypotheses:
+        """The best of the leading hypotheses after articulated registration of the predicted shape."""
+        options = self.inference
+        leading = distance.topk(min(options.candidates, distance.shape[1]), largest=False).indices
+        candidates = hypotheses.select(leading)
+        count = leading.shape[1]
+        base, state, error = self._register(
+            hypotheses,
+            points.repeat_interleave(count, dim=0),
+            candidates.base.flatten(0, 1),
+            candidates.state.flatten(0, 1),
+            candidates.axis.flatten(0, 1),
+            (options.coarse_scale, options.fine_scale),
+            options.rounds,
+        )
+        best = error.view(-1, count).argmin(dim=1)
+        chosen = candidates.select(best)
+        rows = torch.arange(len(points), device=points.device)
+        return chosen.at(
+            base.view(-1, count, 4, 4)[rows, best][:, None], state.view(len(points), count, -1)[rows, best][:, None]
+        )
+
+    @torch.no_grad()
+    def _register(
+        self,
+        hypotheses: Hypotheses,
+        points: Tensor,  # [B C, N, 3]
+        base: Tensor,  # [B C, 4, 4]
+        state: Tensor,  # [B C, J]
+        axis: Tensor,  # [B C, J, 3]
+        scales: tuple[float, float],
+        rounds: int,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        copies = len(points) // len(hypotheses.part_shape)
+        shape = hypotheses.object_shape().detach()
+        label = torch.arange(self.num_parts, device=points.device).repeat_interleave(shape.shape[2])
+        template = LabelledTemplate(shape.flatten(1, 2).repeat_interleave(copies, dim=0), label, self.num_parts)
+        pivot = hypotheses.pivot.detach().repeat_interleave(copies, dim=0)
+        joints = JointModel(hypotheses.chain, axis.detach(), pivot, hypotheses.joint_type)
+        return register_articulated(template, joints, points, base.detach(), state.detach(), scales, rounds)
+
+    def _prediction(self, chosen: Hypotheses, points: Tensor) -> Prediction:
+        """Package one hypothesis per cloud."""
+        pose = chosen.object_pose()[:, 0]
+        part_pose = pose.clone()
+        part_pose[..., :3, 3] = transform_points(pose, chosen.assembly[:, :, None])[:, :, 0]
+        chain = chosen.chain
+        parent = torch.tensor(chain.parent, device=points.device)
+        to_part = distances_to_parts(points, chosen.posed()[:, 0])
+        shape = (len(points), len(parent))
+        axis, pivot = chosen.axis[:, 0], chosen.pivot
+        parent_pose = pose[:, parent]
+        return Prediction(
+            part_id=to_part.argmin(dim=-1),
+            part_probability=(to_part.square() / (-2 * self.objective.posterior_scale**2)).softmax(dim=-1),
+            part_pose=part_pose,
+            part_shape=chosen.part_shape,
+            assembly=chosen.assembly,
+            base_pose=chosen.base[:, 0],
+            joint_parent=parent.expand(shape),
+            joint_child=torch.tensor(chain.child, device=points.device).expand(shape),
+            joint_type=torch.full(shape, chosen.joint_type, device=points.device),
+            joint_axis=(parent_pose[..., :3, :3] @ axis[..., None]).squeeze(-1),
+            joint_pivot=transform_points(parent_pose, pivot[:, :, None])[:, :, 0],
+            joint_state=chosen.state[:, 0],
+            canonical_axis=axis,
+            canonical_pivot=pivot,
+            reconstruction_error=chamfer(points, chosen.posed()[:, 0].flatten(1, 2)),
+        )
+
+    def predict_cloud(
+        self,
+        points: np.ndarray,  # [N, 3] any unit and origin
+        refine: bool | None = None,
+    ) -> tuple[Prediction, np.ndarray, float, np.ndarray]:
+        """Predict a scan of unknown scale: several scales within the training clouds' range, the best reconstruction wins.
+
+        Returns:
+            The prediction (B = 1), centre [3] and scale of the normalisation, and the normalised points it labels.
+        """
+        cloud, center, _ = normalise_cloud(points, self.num_points, scale=1.0)
+        radius = float(np.linalg.norm(np.asarray(points, dtype=np.float64) - center, axis=1).mean())
+        spread = float((self.radius_square - self.radius_mean.square()).clamp(min=0).sqrt())
+        scales = [radius / (float(self.radius_mean) + shift * spread) for shift in SCALE_STARTS]
+        batch = torch.stack([torch.as_tensor(cloud / scale, dtype=torch.float32) for scale in scales]).to(self.device)
+        prediction = self.predict_points(batch, refine)
+        size = batch.norm(dim=-1).mean(dim=-1)
+        best = int((prediction.reconstruction_error / size).argmin())
+        return prediction[best : best + 1], center, scales[best], batch[best].cpu().numpy()
+
+    @property
+    def num_points(self) -> int:
+        """Points that a scan is thinned to: as many as a training cloud had."""
+        return int(self.hparams.get("num_points", 512))
+
+    @property
+    def state_range(self) -> Tensor:
+        """[J, 2] lowest and highest joint state seen in training."""
+        return self.state_limits
+
+    # Training
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        """Adam; the category's shapes and joints are a group of their own."""
+        category = {"template", "assembly", "axis", "pivot", "confidence"}
+        named = dict(self.named_parameters())
+        shared = [p for name, p in named.items() if name.removeprefix("articulated.") in category]
+        others = [p for name, p in named.items() if name.removeprefix("articulated.") not in category]
+        optimizer = torch.optim.Adam(
+            [{"params": others}, {"params": shared}], lr=self.schedule.learning_rate, betas=(0.9, 0.999), eps=1e-8
+        )
+        rates = [self.network_rate, self.category_rate]
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, rates)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def network_rate(self, step: int) -> float:
+        """Learning rate relative to the initial one, at a step."""
+        s = self.schedule
+        if self.recipe == "paper":
+            return s.decay ** (step // s.decay_every)
+        return s.decay + (1 - s.decay) * 0.5 * (1 + math.cos(math.pi * min(step / s.steps, 1)))
+
+    def category_rate(self, step: int) -> float:
+        """The same for category-level shapes and joints: held during the staged recipe's warm-up."""
+        if self.recipe == "paper":
+            return self.network_rate(step)
+        held = step < self.schedule.rigid_steps + self.schedule.warmup_steps
+        return 0.0 if held else self.schedule.category_rate * self.network_rate(step)
+
+    def on_train_start(self) -> None:
+        """Remember how many points a cloud has."""
+        self.hparams["num_points"] = self.trainer.datamodule.hparams.num_points
+
+    def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
+        """One step of whichever stage the schedule is in."""
+        points = split_labels(batch)[0]["points"]
+        self._track_radius(points)
+        if self.global_step < self.schedule.rigid_steps:
+            loss = self._rigid_loss(points)
+            self.log("loss", loss.detach(), prog_bar=True)
+            return loss
+        if self.recipe == "paper":
+            return self._paper_step(points)
+        if self.registered is None:
+            self._discover()
+        if self.global_step < self.schedule.rigid_steps + self.schedule.warmup_steps:
+            return self._warmup_step(len(points))
+        return self._staged_step(points)
+
+    @torch.no_grad()
+    def _track_radius(self, points: Tensor) -> None:
+        radius = (points - points.mean(dim=1, keepdim=True)).norm(dim=-1).mean(dim=1)
+        weight = max(0.01, 1 / (self.global_step + 1))
+        self.radius_mean.lerp_(radius.mean(), weight)
+        self.radius_square.lerp_(radius.square().mean(), weight)
+
+    def _rigid_loss(self, points: Tensor) -> Tensor:
+        hypotheses = self.rigid(points)
+        posed = hypotheses.posed()
+        best = hypothesis_distances(points, posed, bidirectional=not self.objective.unidirectional).argmin(dim=1)
+        chosen = posed[torch.arange(len(points), device=points.device), best]
+        return chamfer(points, chosen, bidirectional=not self.objective.unidirectional).mean()
+
+    def _paper_step(self, points: Tensor) -> Tensor:
+        aligned, _ = self.align(points)
+        losses = []
+        for hypotheses in self.iterate(aligned):
+            winner, _ = winning_hypothesis(hypotheses, aligned, self.objective.unidirectional)
+            selected = hypotheses.select(winner)
+            terms = paper_terms(selected, aligned, self.objective)
+            losses.append(terms.loss)
+        self._track(terms, selected)
+        return torch.stack(losses).mean()
+
+    def _warmup_step(self, size: int) -> Tensor:
+        """Registered clouds under fresh rotations: poses are known, so the hypothesis nearest to them trains."""
+        device = self.device
+        generator = torch.Generator().manual_seed(hash((self.global_step, self.global_rank)) % 2**31)
+        index = torch.randint(len(self.registered["points"]), (size,), generator=generator)
+        rotation = roma.unitquat_to_rotmat(torch.nn.functional.normalize(torch.randn(size, 4, generator=generator), dim=-1))
+        turn = se3(rotation, torch.zeros(size, 3)).to(device)
+        points, base, state = (self.registered[name][index].to(device) for name in ("points", "base", "state"))
+        aligned, pose = self.align(transform_points(turn, points))
+        base = invert_se3(pose) @ turn @ base
+        losses, estimate, labels = [], None, None
+        target = PoseTarget(base, state)
+        for _ in range(self.network_options.iterations):
+            hypotheses = self.articulated(aligned, estimate, labels)
+            start = torch.eye(3, device=device) if estimate is None else estimate.base[:, 0, :3, :3]
+            nearest = self.group.nearest(start.transpose(-1, -2) @ base[:, :3, :3])
+            selected = hypotheses.select(nearest)
+            terms = staged_terms(selected, aligned, self.objective, target)
+            losses.append(terms.loss)
+            if self.network_options.pose_aware:
+                winner, _ = winning_hypothesis(hypotheses, aligned, self.objective.unidirectional)
+                estimate = hypotheses.select(winner)
+                labels = self.part_labels(estimate, aligned)
+        self._track(terms, selected)
+        return torch.stack(losses).mean()
+
+    def _staged_step(self, points: Tensor) -> Tensor:
+        """Any training cloud: the best reconstruction trains, drawn to where a few rounds of registration move it."""
+        aligned, _ = self.align(points)
+        losses = []
+        for hypotheses in self.iterate(aligned):
+            winner, before = winning_hypothesis(hypotheses, aligned, self.objective.unidirectional)
+            selected = hypotheses.select(winner)
+            target = None
+            if self.objective.distillation:
+                start = selected.base[:, 0], selected.state[:, 0], selected.axis[:, 0]
+                base, state, after = self._register(selected, aligned, *start, (0.04, 0.02), 4)
+                better = after < before
+                target = PoseTarget(
+                    torch.where(better[:, None, None], base, start[0].detach()),
+                    torch.where(better[:, None], state, start[1].detach()),
+                )
+            terms = staged_terms(selected, aligned, self.objective, target)
+            losses.append(terms.loss)
+        self._track(terms, selected)
+        return torch.stack(losses).mean()
+
+    @torch.no_grad()
+    def _track(self, terms: Terms, selected: Hypotheses) -> None:
+        """Log the terms and the warning signs (design 3.5); follow confidences and joint limits."""
+        net = self.articulated
+        net.mean_confidence.lerp_(selected.confidence.mean(dim=0), max(0.02, 1 / (self.global_step + 1)))
+        state = selected.state[:, 0]
+        seen = torch.stack([state.amin(dim=0), state.amax(dim=0)], dim=-1)
+        self.state_limits.lerp_(seen, 0.02 if self.state_limits.any() else 1.0)
+        occupancy = one_hot(terms.association.argmax(dim=-1), self.num_parts).float().mean(dim=(0, 1))
+        spread = state.std(dim=0).mean() if len(state) > 1 else state.new_zeros(())
+        self.log_dict(
+            {
+                "loss": terms.loss,
+                "rec": terms.reconstruction,
+                "reg": terms.joints,
+                "distill": terms.distillation,
+                "seg": terms.segmentation,
+                "state_spread": spread.rad2deg() if net.joint_type == REVOLUTE else spread,
+                "smallest_part": occupancy.min(),
+            },
+            prog_bar=True,
+        )
+
+    @torch.no_grad()
+    def _discover(self) -> None:
+        """Part discovery on a fixed subset of the training clouds; the same on every rank."""
+        options = self.discovery
+        batches = [split_labels(b)[0] for b in self.trainer.datamodule.calibration_dataloader(options.clouds)]
+        dense = torch.cat([b["dense_points"] for b in batches]).float()
+        with torch.random.fork_rng(devices=[]):
+            found = discover(dense, self.num_parts, self.articulated.joint_type, options)
+        kept = found.error.argsort()[: int(options.keep * len(dense))]
+        self.registered = {
+            "points": dense[kept, : self.num_points],
+            "base": found.base[kept],
+            "state": found.state[kept],
+        }
+        self._adopt(found, dense)
+
+    def _adopt(self, found: ArticulatedTemplate, dense: Tensor) -> None:
+        """Make the discovered template and joints the network's category-level shapes and joints."""
+        net = self.articulated
+        best = int(found.error.argmin())
+        pose = found.part_pose()[best]
+        nearest = torch.cdist(dense[best], found.template.posed(found.part_pose()[best : best + 1])[0]).argmin(dim=1)
+        label = found.template.label[nearest]
+        canonical = torch.einsum("kij,nj->kni", invert_se3(pose)[:, :3, :3], dense[best]) + invert_se3(pose)[:, None, :3, 3]
+        for part in range(self.num_parts):
+            points = canonical[part, label == part].cpu().numpy()
+            order = farthest_point_order(points, min(len(points), net.shape_points))
+            shape = torch.as_tensor(np.resize(points[order], (net.shape_points, 3)))
+            center = shape.mean(dim=0)
+            net.assembly.data[part] = center
+            net.template.data[part] = shape - center
+            net.principal_axes[part] = torch.linalg.eigh((shape - center).T @ (shape - center)).eigenvectors
+        chain = found.joints.chain
+        pairs = {tuple(p): e for e, p in enumerate(net.pairs.tolist())}
+        net.confidence.data.zero_()
+        for j, (parent, child) in enumerate(zip(chain.parent, chain.child, strict=True)):
+            pair = pairs[min(parent, child), max(parent, child)]
+            net.axis.data[pair] = found.joints.axis[j]
+            net.pivot.data[pair] = found.joints.pivot[j]
+            net.confidence.data[pair] = 2.0
+        net.mean_confidence.copy_(net.confidence)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Mark the checkpoint as ours and keep the registered clouds, so that training resumes without discovery."""
+        checkpoint[CHECKPOINT_KEY] = {"version": 1, "registered": self.registered}
+        checkpoint["hyper_parameters"] = dict(self.hparams)
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Take the registered clouds back."""
+        self.registered = checkpoint[CHECKPOINT_KEY]["registered"]
+
+    # Validation and test
+
+    def validation_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
+        """Reconstruction error of held-out rotations of training clouds; no label is read."""
+        points = split_labels(batch)[0]["points"]
+        if self.global_step < self.schedule.rigid_steps or (self.recipe == "staged" and self.registered is None):
+            return
+        error = self.predict_points(points, refine=False).reconstruction_error.mean()
+        self.log("val_reconstruction", error, prog_bar=True, batch_size=len(points), sync_dist=True)
+
+    def on_test_start(self) -> None:
+        """Relate slots and canonical spaces to the labelled ones, on training clouds."""
+        loader = self.trainer.datamodule.calibration_dataloader(self.calibration_samples)
+        batches = [self.transfer_batch_to_device(batch, self.device, 0) for batch in loader]
+        predictions = [self.predict_points(split_labels(batch)[0]["points"]) for batch in batches]
+        self.test_report = TestReport(predictions, batches).to(self.device)
+
+    def test_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
+        """Predict, then compare."""
+        start = time.perf_counter()
+        prediction = self.predict_points(split_labels(batch)[0]["points"])
+        self.test_report.update(prediction, batch, time.perf_counter() - start)
+
+    def on_test_end(self) -> None:
+        """Write metrics.json, metrics.csv and the picture of best, median and worst samples."""
+        folder = Path(self.trainer.log_dir or self.trainer.default_root_dir)
+        data = self.trainer.datamodule
+        self.test_report.write(folder, data.manifest, str(self.trainer.ckpt_path), self.inference.refine)

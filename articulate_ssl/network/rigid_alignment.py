@@ -1,0 +1,63 @@
+"""Stage 0: rigid alignment of the whole shape, before any part is known.
+
+The paper's method needs clouds whose orientation is roughly canonical (its authors' code trains this network first; the
+paper mentions it only in a removed comment as "zero iteration"). The whole object is one rigid part here: a category
+template plus a small instance flow, posed by one rotation hypothesis per group element; the best hypothesis trains.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import roma
+import torch
+from torch import Tensor, nn
+
+from articulate_ssl.groups import RotationGroup
+from articulate_ssl.network.so3_pointnet import GroupAttentionPooling, SO3PointNet
+
+
+class RigidHypotheses(NamedTuple):
+    """One pose of the canonical shape per group element; posed points are `rotation @ shape + translation`."""
+
+    rotation: Tensor  # [B, G, 3, 3]
+    translation: Tensor  # [B, G, 3]
+    shape: Tensor  # [B, M, 3]
+
+    def posed(self) -> Tensor:
+        """Reconstructions Y^g, [B, G, M, 3]."""
+        return torch.einsum("bgij,bmj->bgmi", self.rotation, self.shape) + self.translation[:, :, None]
+
+
+class RigidAlignment(nn.Module):
+    """Whole-shape EPN auto-encoder: invariant canonical shape, one residual rotation and translation per group element."""
+
+    def __init__(
+        self, backbone: nn.Module, group: RotationGroup, in_dim: int, dim: int, shape_points: int, flow_bound: float = 0.05
+    ) -> None:
+        """Args: feature backbone with `in_dim` output channels; hidden width; points of the canonical shape; flow bound."""
+        super().__init__()
+        elements = torch.as_tensor(group.elements).float()
+        self.register_buffer("elements", elements, persistent=False)
+        self.backbone = backbone
+        self.pointnet = SO3PointNet(in_dim, dim, elements)
+        self.pool = GroupAttentionPooling(dim)
+        self.pose_head = nn.Sequential(nn.Linear(dim, dim), nn.LeakyReLU(0.1), nn.Linear(dim, 6))
+        self.flow_head = nn.Sequential(nn.Linear(dim, dim), nn.LeakyReLU(0.1), nn.Linear(dim, 3 * shape_points))
+        self.flow_bound = flow_bound
+        self.template = nn.Parameter(0.2 * torch.randn(shape_points, 3))
+        for head in (self.pose_head, self.flow_head):
+            nn.init.normal_(head[-1].weight, std=1e-3)
+            nn.init.zeros_(head[-1].bias)
+
+    def forward(self, points: Tensor) -> RigidHypotheses:
+        """Hypotheses for clouds [B, N, 3]."""
+        features = self.backbone(points)
+        centers = points[:, : features.shape[1]]
+        mean = points.mean(dim=1, keepdim=True)
+        whole = self.pointnet(features, centers - mean, centers.new_ones(*centers.shape[:2], 1)).squeeze(1).float()
+        residual = self.pose_head(whole).float()
+        flow = self.flow_head(self.pool(whole)).float().view(len(points), -1, 3)
+        rotation = self.elements @ roma.rotvec_to_rotmat(residual[..., :3])
+        translation = torch.einsum("gij,bgj->bgi", self.elements, residual[..., 3:]) + mean
+        return RigidHypotheses(rotation, translation, self.template + self.flow_bound * flow.tanh())

@@ -1,0 +1,282 @@
+"""Part discovery: find a category's parts and joints from unlabelled clouds alone, by registration.
+
+1. *Rigid alignment*: one typical cloud is registered to all others from every group rotation.
+2. *Splits*: cut the typical cloud into K pieces at random, register every piece to every aligned cloud on its own, and give
+   each template point to the piece whose motion explains it best in all clouds: points that move together end up
+   together. Of many random cuts the winner is the one that reconstructs best *after* each pair's relative motion has been
+   reduced to one joint, which is what a wrong split cannot survive.
+3. *Rounds*: search every cloud again with the articulated template, from many orientations (this is what rights clouds
+   that the rigid template fitted upside down), then solve labels and joints again from the clouds that fit.
+
+No network, no gradient, no label. It is to the staged recipe what the "zero iteration" is to the original.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+
+import roma
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from articulate_ssl.groups import rotation_group
+from articulate_ssl.kinematic_chain import extract_chain, pair_index
+from articulate_ssl.registration import (
+    JointModel,
+    LabelledTemplate,
+    chamfer_l1,
+    register_rigid,
+    search_articulated,
+    update_poses,
+)
+from datamodules.geometry import PRISMATIC, REVOLUTE, invert_se3, screw_motion, se3, transform_points
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class DiscoveryOptions:
+    """How much work part discovery does.
+
+    Attributes:
+        clouds: Training clouds that are registered.
+        split_clouds: The best aligned of them, on which splits are tried.
+        points: Points per cloud and template in registration.
+        starts: Random splits.
+        rounds: Rounds of articulated search, relabelling and joint fitting.
+        keep: Share of the clouds, best fitted first, that labels and joints are solved from.
+        min_share: Splits with a part smaller than this share of the template are discarded.
+        seed: Of the random splits.
+    """
+
+    clouds: int = 192
+    split_clouds: int = 48
+    points: int = 256
+    starts: int = 12
+    rounds: int = 3
+    keep: float = 0.75
+    min_share: float = 0.05
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class ArticulatedTemplate:
+    """A category's labelled template with joints, registered to n clouds.
+
+    Canonical object space has the template's principal axes as coordinate axes, so that the half-turns under which an
+    object nearly maps to itself are elements of the rotation group. Every joint is at the clouds' mean state.
+
+    Attributes:
+        template: [T] labelled points.
+        joints: Joint lines and kinematic chain.
+        base: [n, 4, 4] canonical object space -> cloud.
+        state: [n, J] zero-mean joint states.
+        error: [n] Chamfer-L1 distance of every cloud to its reconstruction.
+    """
+
+    template: LabelledTemplate
+    joints: JointModel
+    base: Tensor
+    state: Tensor
+    error: Tensor
+
+    def part_pose(self) -> Tensor:
+        """[n, K, 4, 4] canonical object space -> cloud."""
+        return self.joints.part_pose(self.base, self.state)
+
+
+def discover(
+    clouds: Tensor,  # [n, N, 3] in any orientation
+    num_parts: int,
+    joint_type: int,
+    options: DiscoveryOptions,
+) -> ArticulatedTemplate:
+    """Parts and joints of the category, registered to all the clouds.
+
+    Raises:
+        RuntimeError: if no split into `num_parts` moving parts survives.
+    """
+    clouds = clouds[:, : options.points].contiguous()
+    reference = clouds[choose_reference(clouds)]
+    rotations = rotation_group(60).elements.to(clouds)
+    coarse = max(64, options.points // 2)
+    rigid, error = register_rigid(reference[:coarse], clouds[:, :coarse], rotations, keep=1)
+    log.info("rigid alignment: median Chamfer-L1 %.4f", error[:, 0].median())
+
+    best_aligned = error[:, 0].argsort()[: options.split_clouds]
+    aligned = transform_points(invert_se3(rigid[best_aligned, 0]), clouds[best_aligned])
+    found = split_template(aligned, reference, num_parts, joint_type, options)
+    log.info("best split of %d starts: Chamfer-L1 %.4f", options.starts, found.error.mean())
+
+    for step in range(options.rounds):
+        base, state, error = _search(found, clouds, rotations)
+        kept = error.argsort()[: int(options.keep * len(clouds))]
+        pose = found.joints.part_pose(base[kept], state[kept])
+        template = found.template
+        for scale in (0.03, 0.028, 0.026, 0.024, 0.022, 0.02):
+            pose = update_poses(template, pose, clouds[kept], scale)
+            template = relabel(template, pose, clouds[kept], cap=4 * scale)
+        found = fit_joints(template, pose, clouds[kept], joint_type)
+        log.info("round %d: Chamfer-L1 %.4f of the kept clouds", step + 1, found.error.mean())
+    base, state, error = _search(found, clouds, rotations)
+    return replace(found, base=base, state=state, error=error)
+
+
+def _search(found: ArticulatedTemplate, clouds: Tensor, rotations: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    spread = 1.5 * found.state.std(dim=0)
+    states = torch.stack([-spread, torch.zeros_like(spread), spread])
+    return search_articulated(found.template, found.joints, clouds, rotations, states)
+
+
+def choose_reference(clouds: Tensor) -> int:
+    """Index of the most typical cloud: the medoid of the sorted distances to the centre (invariant to rotation)."""
+    radius = (clouds - clouds.mean(dim=1, keepdim=True)).norm(dim=-1).sort(dim=1).values
+    return int(torch.cdist(radius, radius, p=1).sum(dim=1).argmin())
+
+
+def random_split(template: Tensor, num_parts: int, generator: torch.Generator) -> Tensor:
+    """[T] labels from K - 1 parallel cuts along a random direction, at random quantiles."""
+    direction = functional.normalize(torch.randn(3, generator=generator), dim=0)
+    height = template @ direction.to(template)
+    cuts = (torch.rand(num_parts - 1, generator=generator) * 0.6 + 0.2).sort().values
+    return torch.bucketize(height, torch.quantile(height, cuts.to(template)))
+
+
+def split_template(
+    aligned: Tensor,  # [n, N, 3]
+    template: Tensor,  # [T, 3]
+    num_parts: int,
+    joint_type: int,
+    options: DiscoveryOptions,
+) -> ArticulatedTemplate:
+    """Best of many random splits after multi-body registration.
+
+    Raises:
+        RuntimeError: if every start loses a part.
+    """
+    generator = torch.Generator().manual_seed(options.seed)
+    best: ArticulatedTemplate | None = None
+    for _ in range(options.starts):
+        labelled = LabelledTemplate(template, random_split(template, num_parts, generator), num_parts)
+        pose = torch.eye(4).to(template).expand(len(aligned), num_parts, 4, 4)
+        for step, scale in enumerate(torch.logspace(-1.1, -1.7, 16).tolist()):
+            pose = update_poses(labelled, pose, aligned, scale)
+            if step % 2 == 1:
+                labelled = relabel(labelled, pose, aligned, cap=4 * scale)
+        share = torch.bincount(labelled.label, minlength=num_parts) / len(template)
+        if share.min() < options.min_share:
+            continue
+        found = fit_joints(labelled, pose, aligned, joint_type)
+        if best is None or found.error.mean() < best.error.mean():
+            best = found
+    if best is None:
+        raise RuntimeError(
+            f"part discovery lost a part in all {options.starts} starts: the clouds do not show {num_parts} parts that "
+            "move on their own; check the category's number of parts, or allow more starts"
+        )
+    return best
+
+
+def relabel(
+    template: LabelledTemplate,
+    pose: Tensor,  # [n, K, 4, 4]
+    clouds: Tensor,  # [n, N, 3]
+    cap: float,  # distances beyond this count as this
+    neighbors: int = 8,
+) -> LabelledTemplate:
+    """Give every template point to the part whose motion brings it closest to the clouds, smoothed over neighbours."""
+    cost = template.points.new_zeros(len(template.points), template.num_parts)
+    for part in range(template.num_parts):
+        moved = transform_points(pose[:, part], template.points)  # [n, T, 3]
+        for cloud, points in zip(clouds.split(32), moved.split(32), strict=True):
+            cost[:, part] += torch.cdist(points, cloud).amin(dim=2).clamp(max=cap).sum(dim=0)
+    near = torch.cdist(template.points, template.points).topk(neighbors, largest=False).indices
+    return replace(template, label=cost[near].mean(dim=1).argmin(dim=-1))
+
+
+def fit_joints(
+    template: LabelledTemplate,
+    pose: Tensor,  # [n, K, 4, 4] freely registered parts
+    clouds: Tensor,  # [n, N, 3]
+    joint_type: int,
+) -> ArticulatedTemplate:
+    """Reduce free part poses to a tree of one-degree-of-freedom joints, in the canonical object space described above."""
+    num_parts = template.num_parts
+    gaps = []
+    for i, j in pair_index(num_parts).tolist():
+        relative = invert_se3(pose[:, i]) @ pose[:, j]
+        axis, pivot, state, mean = _fit_screw(relative, joint_type)
+        model = screw_motion(axis.expand(len(state), 3), pivot.expand(len(state), 3), state, joint_type) @ mean
+        part = template.points[template.label == j]
+        gaps.append((transform_points(model, part) - transform_points(relative, part)).norm(dim=-1).mean())
+    chain = extract_chain(-torch.stack(gaps), num_parts)
+
+    into_object = {chain.root: torch.eye(4).to(pose)}
+    axes, pivots, states = [], [], []
+    for parent, child in zip(chain.parent, chain.child, strict=True):
+        axis, pivot, state, mean = _fit_screw(invert_se3(pose[:, parent]) @ pose[:, child], joint_type)
+        frame = into_object[parent]
+        into_object[child] = frame @ mean
+        axes.append(frame[:3, :3] @ axis)
+        pivots.append(transform_points(frame, pivot[None])[0])
+        states.append(state)
+    points = template.points.clone()
+    for part in range(num_parts):
+        mine = template.label == part
+        points[mine] = transform_points(into_object[part], points[mine])
+
+    frame = _principal_frame(points)
+    points = transform_points(frame, points)
+    axis = torch.stack(axes) @ frame[:3, :3].T
+    pivot = transform_points(frame, torch.stack(pivots))
+    # Where a pivot sits along its axis is a convention: the middle of the part it moves.
+    center = torch.stack([points[template.label == child].mean(dim=0) for child in chain.child])
+    pivot = pivot + ((center - pivot) * axis).sum(dim=1, keepdim=True) * axis
+
+    joints = JointModel(chain, axis, pivot, joint_type)
+    template, state = replace(template, points=points), torch.stack(states, dim=1)
+    base = pose[:, chain.root] @ invert_se3(frame)
+    error = chamfer_l1(clouds, template.posed(joints.part_pose(base, state)))
+    return ArticulatedTemplate(template, joints, base, state, error)
+
+
+def motion_share(found: ArticulatedTemplate, centered: Tensor) -> Tensor:
+    """[J] share of each joint's motion that the base takes relative to `centered` [n, 4, 4], the clouds' own frames."""
+    relative = invert_se3(centered) @ found.base
+    if found.joints.joint_type == REVOLUTE:
+        moved = roma.rotmat_to_rotvec(relative[:, :3, :3])
+    else:
+        moved = relative[:, :3, 3] - relative[:, :3, 3].mean(dim=0)
+    slope = torch.linalg.lstsq(found.state, moved).solution  # [J, 3]
+    return -(slope * found.joints.axis).sum(dim=1)
+
+
+def _principal_frame(points: Tensor) -> Tensor:
+    """Pose [4, 4] that moves points to their centre and principal axes (right-handed)."""
+    center = points.mean(dim=0)
+    axes = torch.linalg.eigh((points - center).T @ (points - center)).eigenvectors
+    axes = axes * torch.sign(torch.linalg.det(axes))
+    return se3(axes.T, -(axes.T @ center))
+
+
+def _fit_screw(relative: Tensor, joint_type: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Axis [3], pivot [3], states [n] and mean [4, 4] with relative poses [n, 4, 4] ~ screw(axis, pivot, state) @ mean."""
+    mean_rotation = roma.special_procrustes(relative[:, :3, :3].mean(dim=0))
+    if joint_type == PRISMATIC:
+        mean = se3(mean_rotation, relative[:, :3, 3].mean(dim=0))
+        shift = relative[:, :3, 3] - mean[:3, 3]
+        axis = torch.linalg.eigh(shift.T @ shift).eigenvectors[:, -1]
+        return axis, torch.zeros_like(axis), shift @ axis, mean
+    turn = roma.rotmat_to_rotvec(relative[:, :3, :3] @ mean_rotation.T)
+    axis = torch.linalg.eigh(turn.T @ turn).eigenvectors[:, -1]
+    state = turn @ axis
+    rotation = roma.rotvec_to_rotmat(axis * state[:, None])
+    # t_n = R_n t + (1 - R_n) p is linear in the mean translation t and the pivot p, whose component along the axis is
+    # free: the small ridge picks one.
+    eye = torch.eye(3).to(relative)
+    system = torch.cat([torch.cat([rotation, eye - rotation], dim=2).flatten(0, 1), 1e-3 * torch.eye(6).to(relative)])
+    rhs = torch.cat([relative[:, :3, 3].flatten(), relative.new_zeros(6)])
+    solution = torch.linalg.lstsq(system, rhs[:, None]).solution.squeeze(-1)
+    return axis, solution[3:], state, se3(mean_rotation, solution[:3])

@@ -1,0 +1,222 @@
+"""Registration of a labelled template to point clouds by soft correspondences: rigid, part by part, and articulated.
+
+A soft correspondence is a Gaussian responsibility, as in coherent point drift; correspondences are formed in both
+directions, so that a template covers the cloud as well as lying on it. Clouds never interact: every function treats its
+leading axis as independent problems.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import roma
+import torch
+from torch import Tensor
+
+from articulate_ssl.kinematic_chain import KinematicChain
+from datamodules.geometry import REVOLUTE, invert_se3, screw_motion, se3, transform_points
+
+_BATCH_ENTRIES = 2**25  # entries of one responsibility matrix
+
+
+@dataclass(frozen=True)
+class LabelledTemplate:
+    """Template points with the part each belongs to.
+
+    Attributes:
+        points: [T, 3] canonical object space, or [n, T, 3] where every cloud has its own shape.
+        label: [T] int64.
+        num_parts: K.
+    """
+
+    points: Tensor
+    label: Tensor
+    num_parts: int
+
+    def posed(self, pose: Tensor) -> Tensor:
+        """Points moved with their part, pose [n, K, 4, 4] -> [n, T, 3]."""
+        pose = pose[:, self.label]
+        return (pose[..., :3, :3] @ self.points[..., None]).squeeze(-1) + pose[..., :3, 3]
+
+
+@dataclass(frozen=True)
+class JointModel:
+    """A category's joints in canonical object space.
+
+    Attributes:
+        chain: Kinematic chain.
+        axis: [J, 3] unit, or [n, J, 3].
+        pivot: [J, 3] or [n, J, 3].
+        joint_type: `REVOLUTE` or `PRISMATIC`.
+    """
+
+    chain: KinematicChain
+    axis: Tensor
+    pivot: Tensor
+    joint_type: int
+
+    def articulation(self, state: Tensor) -> Tensor:
+        """Part motions [n, K, 4, 4] in canonical object space at joint states [n, J]."""
+        shape = (*state.shape, 3)
+        return self.chain.part_motion(
+            screw_motion(self.axis.expand(shape), self.pivot.expand(shape), state, self.joint_type)
+        )
+
+    def part_pose(self, base: Tensor, state: Tensor) -> Tensor:
+        """Part poses [n, K, 4, 4] of base poses [n, 4, 4] and joint states [n, J]."""
+        return base[:, None] @ self.articulation(state)
+
+    def read_states(self, template: LabelledTemplate, pose: Tensor) -> Tensor:
+        """Joint states [n, J] that fit freely estimated part poses [n, K, 4, 4] best."""
+        states = []
+        for j, (parent, child) in enumerate(zip(self.chain.parent, self.chain.child, strict=True)):
+            relative = invert_se3(pose[:, parent]) @ pose[:, child]
+            axis = self.axis[..., j, :]
+            if self.joint_type == REVOLUTE:
+                motion = roma.rotmat_to_rotvec(relative[:, :3, :3])
+            else:
+                center = template.points[..., template.label == child, :].mean(dim=-2).expand(len(pose), 3)
+                motion = transform_points(relative, center[:, None])[:, 0] - center
+            states.append((motion * axis).sum(dim=-1))
+        return torch.stack(states, dim=-1)
+
+
+def chamfer_l1(
+    clouds: Tensor,  # [n, N, 3]
+    posed: Tensor,  # [n, T, 3]
+) -> Tensor:  # [n]
+    """Bidirectional mean nearest distance."""
+    errors = []
+    for cloud, shape in _batches(clouds, posed):
+        distance = torch.cdist(cloud, shape)
+        errors.append(distance.amin(dim=2).mean(dim=1) + distance.amin(dim=1).mean(dim=1))
+    return torch.cat(errors)
+
+
+def update_poses(
+    template: LabelledTemplate,
+    pose: Tensor,  # [n, K, 4, 4]
+    clouds: Tensor,  # [n, N, 3]
+    scale: float,  # standard deviation of the correspondence kernel
+) -> Tensor:  # [n, K, 4, 4]
+    """One round of soft-correspondence registration of every part on its own (weighted Kabsch)."""
+    weights, targets = [], []
+    for cloud, posed in _batches(clouds, template.posed(pose)):
+        logits = torch.cdist(cloud, posed).square_().mul_(-1 / (2 * scale**2))
+        explain, attract = logits.softmax(dim=2), logits.softmax(dim=1)
+        weight = explain.sum(dim=1) + 1.0
+        weights.append(weight)
+        targets.append((explain.add_(attract).transpose(1, 2) @ cloud) / weight[..., None])
+    weight, target = torch.cat(weights), torch.cat(targets)
+    points = template.points.expand(len(clouds), -1, 3)
+    poses = []
+    for part in range(template.num_parts):
+        mine = (template.label == part).nonzero().squeeze(-1)
+        if len(mine) < 4:
+            poses.append(pose[:, part])
+            continue
+        poses.append(_register(points[:, mine], target[:, mine], weight[:, mine]))
+    return torch.stack(poses, dim=1)
+
+
+def register_rigid(
+    template: Tensor,  # [T, 3]
+    clouds: Tensor,  # [n, N, 3]
+    rotations: Tensor,  # [H, 3, 3] starts, about the centres
+    keep: int,
+    scales: tuple[float, float] = (0.15, 0.05),
+    rounds: int = 8,
+) -> tuple[Tensor, Tensor]:
+    """The `keep` best rigid registrations of a template to every cloud over all rotation starts.
+
+    Returns:
+        Poses [n, keep, 4, 4] template -> cloud, best first, and their Chamfer-L1 errors [n, keep].
+    """
+    whole = LabelledTemplate(template, torch.zeros(len(template), dtype=torch.long, device=template.device), 1)
+    starts = len(rotations)
+    shift = clouds.mean(dim=1)[:, None] - rotations @ template.mean(dim=0)  # [n, H, 3]
+    pose = se3(rotations.expand(len(clouds), -1, -1, -1), shift).flatten(0, 1)[:, None]
+    copies = clouds.repeat_interleave(starts, dim=0)
+    for scale in _annealed(scales, rounds):
+        pose = update_poses(whole, pose, copies, scale)
+    error = chamfer_l1(copies, whole.posed(pose)).view(-1, starts)
+    best = error.topk(min(keep, starts), largest=False)
+    rows = torch.arange(len(clouds), device=clouds.device)[:, None]
+    return pose.view(-1, starts, 4, 4)[rows, best.indices], best.values
+
+
+def register_articulated(
+    template: LabelledTemplate,
+    joints: JointModel,
+    clouds: Tensor,  # [n, N, 3]
+    base: Tensor,  # [n, 4, 4] start
+    state: Tensor,  # [n, J] start
+    scales: tuple[float, float],
+    rounds: int,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Register an articulated template without leaving its joints.
+
+    Every round moves each part freely, reads the joint states off the relative motions, and moves the articulated whole
+    rigidly onto where the parts went.
+
+    Returns:
+        Base poses [n, 4, 4], joint states [n, J], Chamfer-L1 errors [n].
+    """
+    still = torch.eye(4, dtype=base.dtype, device=base.device).expand_as(base)
+    for scale in _annealed(scales, rounds):
+        free = update_poses(template, joints.part_pose(base, state), clouds, scale)
+        state = joints.read_states(template, free)
+        base = _register(template.posed(joints.part_pose(still, state)), template.posed(free))
+    return base, state, chamfer_l1(clouds, template.posed(joints.part_pose(base, state)))
+
+
+def search_articulated(
+    template: LabelledTemplate,
+    joints: JointModel,
+    clouds: Tensor,  # [n, N, 3]
+    rotations: Tensor,  # [H, 3, 3] starts, about the centres
+    states: Tensor,  # [Q, J] joint states to start from
+    coarse_points: int = 96,
+    keep: int = 4,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Best articulated registration of every cloud over all orientations and joint states.
+
+    All starts are registered coarsely on the first `coarse_points` points of cloud and template (farthest-point order), the best `keep` are
+    finished on all points.
+
+    Returns:
+        Base poses [n, 4, 4], joint states [n, J], Chamfer-L1 errors [n].
+    """
+    still = torch.eye(4).to(clouds).expand(len(states), 4, 4)
+    shapes = template.posed(joints.part_pose(still, states))  # [Q, T, 3]
+    shift = clouds.mean(dim=1)[:, None, None] - torch.einsum("hij,qj->hqi", rotations, shapes.mean(dim=1))
+    base = se3(rotations[None, :, None].expand(len(clouds), -1, len(states), -1, -1), shift).flatten(1, 2)
+    state = states.repeat(len(rotations), 1).expand(len(clouds), -1, -1)
+    every = max(1, len(template.label) // coarse_points)
+    coarse = LabelledTemplate(template.points[..., ::every, :], template.label[::every], template.num_parts)
+    stages = (
+        (coarse, clouds[:, :coarse_points], (0.12, 0.04), 6, keep),
+        (template, clouds, (0.05, 0.02), 8, 1),
+    )
+    rows = torch.arange(len(clouds), device=clouds.device)[:, None]
+    for shape, points, scales, rounds, survivors in stages:
+        count = base.shape[1]
+        copies = points.repeat_interleave(count, dim=0)
+        flat = register_articulated(shape, joints, copies, base.flatten(0, 1), state.flatten(0, 1), scales, rounds)
+        base, state, error = (value.unflatten(0, (len(clouds), count)) for value in flat)
+        best = error.topk(min(survivors, count), largest=False).indices
+        base, state, error = base[rows, best], state[rows, best], error[rows, best]
+    return base[:, 0], state[:, 0], error[:, 0]
+
+
+def _register(source: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
+    return se3(*roma.rigid_points_registration(source, target, weights=weight))
+
+
+def _annealed(scales: tuple[float, float], rounds: int) -> list[float]:
+    return torch.logspace(*torch.tensor(scales).log10(), rounds).tolist()
+
+
+def _batches(clouds: Tensor, posed: Tensor):
+    rows = max(1, _BATCH_ENTRIES // (clouds.shape[1] * posed.shape[1]))
+    return zip(clouds.split(rows), posed.split(rows), strict=True)
