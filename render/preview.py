@@ -141,7 +141,8 @@ def _save(figure: Figure, path: Path) -> None:
     """Write a PNG with a palette: a third of the size of true colour."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).quantize(128).save(path, optimize=True)
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
+    picture.quantize(128, Image.Quantize.MAXCOVERAGE).save(path, optimize=True)
 
 
 def main(argv: list[str] | None = None) -> int:

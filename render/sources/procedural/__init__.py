@@ -14,14 +14,15 @@ from render.seeds import generator_for
 from render.sources.procedural import drawer, eyeglasses, laptop, oven, safe, washing_machine
 from render.sources.procedural.shapes import to_trimesh
 
+# How to draw an instance's parameters, and how to build its solids from them.
 GENERATORS = {
-    "drawer": lambda rng: drawer.build(drawer.sample(rng)),
-    "eyeglasses": lambda rng: eyeglasses.build(eyeglasses.sample(rng)),
-    "laptop": lambda rng: laptop.build(laptop.sample_laptop(rng)),
-    "laptop_real": lambda rng: laptop.build(laptop.sample_laptop_real(rng)),
-    "oven": lambda rng: oven.build(oven.sample(rng)),
-    "safe": lambda rng: safe.build(safe.sample(rng)),
-    "washing_machine": lambda rng: washing_machine.build(washing_machine.sample(rng)),
+    "drawer": (drawer.sample, drawer.build),
+    "eyeglasses": (eyeglasses.sample, eyeglasses.build),
+    "laptop": (laptop.sample_laptop, laptop.build),
+    "laptop_real": (laptop.sample_laptop_real, laptop.build),
+    "oven": (oven.sample, oven.build),
+    "safe": (safe.sample, safe.build),
+    "washing_machine": (washing_machine.sample, washing_machine.build),
 }
 NUM_INSTANCES = 10_000  # that have an id; they are made when they are loaded
 
@@ -46,7 +47,8 @@ class ProceduralSource:
         if instance_id not in self.instance_ids():
             known = f"{self.spec.name}-0000 to {self.spec.name}-{NUM_INSTANCES - 1}"
             raise ValueError(f"no procedural instance {instance_id!r} of {self.spec.name}; there are {known}")
-        design = GENERATORS[self.spec.name](generator_for(self.seed, "design", instance_id))
+        sample, build = GENERATORS[self.spec.name]
+        design = build(sample(generator_for(self.seed, "design", instance_id)))
         meshes = tuple(to_trimesh(solid) for solid in design.parts.values())
         return ArticulatedObject(instance_id, self.spec.name, tuple(design.parts), meshes, design.joints).validate()
 

@@ -93,7 +93,10 @@ def sample_laptop_real(rng: np.random.Generator) -> LaptopParameters:
     )
 
 
-def _sample(rng, width, depth, base_thickness, lid_share, bezel) -> LaptopParameters:
+def _sample(
+    rng: np.random.Generator, width: float, depth: float, base_thickness: float, lid_share: float, bezel: float
+) -> LaptopParameters:
+    """Draw what does not distinguish the two categories. `lid_share` is lid over base thickness."""
     boxy = rng.random() < 0.4
     hinge_radius = float(np.clip(base_thickness * rng.uniform(0.22, 0.32), 0.003, 0.007))
     keyboard_width = width * rng.uniform(0.82, 0.93)

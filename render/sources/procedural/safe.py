@@ -13,6 +13,8 @@ from render.sources.procedural.shapes import box, cylinder, extrude, polygon, ro
 
 _GAP = 0.002  # between door and body
 _KNUCKLE_RADIUS = 0.0075
+_INSET_HINGE = (0.012, 0.008)  # an inset door's hinge line: outside the opening, in front of the body
+_MOUNT = 0.005  # half thickness of what carries the knuckles
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ def build(p: SafeParameters) -> Design:
     """Body and closed door, made with the hinge on the left; a right-hinged safe is its mirror image."""
     front = p.depth / 2
     if p.inset_door:
-        pivot = np.array([-p.width / 2 + p.wall - 0.012, p.height / 2, front + 0.008])
+        pivot = np.array([-p.width / 2 + p.wall - _INSET_HINGE[0], p.height / 2, front + _INSET_HINGE[1]])
     else:
         pivot = np.array([-p.width / 2 - _KNUCKLE_RADIUS, p.height / 2, front + _GAP + 0.5 * p.door_thickness])
     parts = {"body": _body(p, front, pivot), "door": _door(p, front, pivot)}
@@ -118,18 +120,11 @@ def _body(p: SafeParameters, front: float, pivot: np.ndarray) -> Manifold:
 def _body_knuckle(p: SafeParameters, front: float, pivot: np.ndarray, low: float, high: float) -> list[Manifold]:
     x, _, z = pivot
     if p.inset_door:
-        mount = box((x - 0.005, low, front - 0.004), (x + 0.006, high, z))
-    else:  # an angle that reaches from the side wall to the hinge line in front of it
-        wall, bent, back = -p.width / 2 + 0.002, x + 0.002, front - 0.02
-        angle = [
-            (x - 0.005, back),
-            (wall, back),
-            (wall, front - 0.004),
-            (bent, front - 0.004),
-            (bent, z),
-            (x - 0.005, z),
-        ]
-        mount = extrude(polygon(angle), "y", low, high)
+        mount = box((x - _MOUNT, low, front - 0.004), (x + _MOUNT, high, z))
+    else:  # an angle from the side wall to the hinge line in front of it
+        into_wall = -p.width / 2 + 0.002
+        plate = box((x - _MOUNT, low, front - 0.02), (into_wall, high, front - 0.004))
+        mount = plate + box((x - _MOUNT, low, front - 0.02), (x + 0.002, high, z))
     return [cylinder(pivot, "y", low, high, _KNUCKLE_RADIUS, segments=16), mount]
 
 
@@ -157,8 +152,9 @@ def _door(p: SafeParameters, front: float, pivot: np.ndarray) -> Manifold:
         x, _, z = pivot
         middle = (bottom + top) / 2
         solids.append(cylinder(pivot, "y", bottom, middle - 2e-4, _KNUCKLE_RADIUS, segments=16))
-        leaf = (z - 0.0065, z - 0.002) if p.inset_door else (z - 0.003, z + 0.003)
-        solids.append(box((x, bottom, leaf[0]), (left + 0.02, middle - 2e-4, leaf[1])))
+        # Before the body's front for inset doors, in the middle of the slab for others.
+        leaf_back, leaf_front = (front + 0.0015, z - 0.002) if p.inset_door else (z - 0.003, z + 0.003)
+        solids.append(box((x, bottom, leaf_back), (left + 0.02, middle - 2e-4, leaf_front)))
     return union(solids)
 
 
