@@ -168,4 +168,4 @@ def _parents(prediction: Prediction) -> list[int | None]:
 def _compact_json(content: dict) -> str:
     """Indented JSON with every list of numbers on one line."""
     text = json.dumps(content, indent=2, allow_nan=False) + "\n"
-    return re.sub(r"\[\n[^\[\]{}]*\]", lambda numbers: re.sub(r"\n\s+", " ", numbers[0]).replace("[ ", "["), text)
+    return re.sub(r"\[\n[^\[\]{}]*\]", lambda numbers: f"[{' '.join(numbers[0][1:-1].split())}]", text)

@@ -143,3 +143,11 @@ def test_kinematic_error_measures_poses_that_disobey_their_joint(tmp_path):
 def test_limits_are_in_the_unit_of_the_scan(tmp_path):
     _, _, summary = write(tmp_path, synthetic.arm)
     assert [j["limits"] for j in summary["joints"]] == [pytest.approx([-0.1, 0.3]), pytest.approx([-0.04, 0.12])]
+
+
+def test_the_json_is_readable_and_keeps_its_numbers(tmp_path):
+    _, _, summary = write(tmp_path, synthetic.laptop, checkpoint="runs/[ 3 ]/a  b.ckpt")
+    text = (tmp_path / "prediction.json").read_text()
+    assert summary["checkpoint"] == "runs/[ 3 ]/a  b.ckpt"
+    assert '"colour": [0, 114, 178]' in text
+    assert "[0.0, 0.0, 0.0, 1.0]" in text
