@@ -46,7 +46,7 @@ def verify_set(
         listed = {entry.name for entry in manifest.shards[split]}
         stray = sorted(path for path in (folder / split).glob("*.npz") if path.name not in listed)
         problems += [f"{path}: not in the manifest" for path in stray]
-        if not listed:
+        if manifest.instances[split] and not listed:
             problems.append(f"{folder / split}: the split has no shards")
         shards += [(split, entry) for entry in manifest.shards[split]]
     for split, entry in progress(shards):

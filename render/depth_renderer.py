@@ -18,7 +18,7 @@ _OPENGL_FROM_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0])
 _DEPTH_MARGIN = 0.01  # of the depth at which near and far plane stand; a tight range makes 24-bit depth exact
 
 
-class RendererUnavailable(RuntimeError):
+class RendererUnavailable(OSError):
     """OpenGL cannot render offscreen on this machine; the message says why."""
 
 

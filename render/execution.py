@@ -1,16 +1,20 @@
-"""Running shard tasks: in this process, in spawned processes, or on a Dask cluster."""
+"""Running shard tasks: in this process, in worker processes, or on a Dask cluster."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
+import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 
 from render.shard_task import ShardResult, ShardTask, make_shard
 
 # Read by the numerical libraries when a worker imports them: parallelism comes from workers, not from threads.
 _ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "LP_NUM_THREADS")}
+
+_START_METHOD = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
 
 
 def run_tasks(tasks: list[ShardTask], workers: int, scheduler: str | None = None) -> Iterator[ShardResult]:
@@ -19,7 +23,8 @@ def run_tasks(tasks: list[ShardTask], workers: int, scheduler: str | None = None
     Args:
         tasks: What to make.
         workers: Number of processes; 1 works in the calling process.
-        scheduler: Address of a Dask scheduler (`tcp://…`) to use instead; its workers must see the same folders.
+        scheduler: Address of a Dask scheduler (`tcp://…`) to use instead; its workers must see the same folders, and
+            have one thread each.
 
     Raises:
         ValueError, OSError: from a task, or if the scheduler cannot be reached.
@@ -33,12 +38,14 @@ def run_tasks(tasks: list[ShardTask], workers: int, scheduler: str | None = None
 
 
 def _run_pool(tasks: list[ShardTask], workers: int) -> Iterator[ShardResult]:
-    # Spawn, not fork: a fork after a GL context was used hangs.
-    context = multiprocessing.get_context("spawn")
+    # Not fork: a fork after a GL context was used hangs. The fork server is a fresh process that only imports.
+    context = multiprocessing.get_context(_START_METHOD)
+    if _START_METHOD == "forkserver":
+        context.set_forkserver_preload([__name__])
     previous = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(_ONE_THREAD)
     try:
-        with ProcessPoolExecutor(min(workers, len(tasks)), mp_context=context) as pool:
+        with ProcessPoolExecutor(min(workers, len(tasks)), mp_context=context, initializer=_end_with_parent) as pool:
             futures = [pool.submit(make_shard, task) for task in tasks]
             try:
                 for future in as_completed(futures):
@@ -46,12 +53,23 @@ def _run_pool(tasks: list[ShardTask], workers: int) -> Iterator[ShardResult]:
             except BaseException:
                 pool.shutdown(cancel_futures=True)
                 raise
+    except BrokenProcessPool as error:
+        raise ChildProcessError(
+            "a worker process was killed, most often for lack of memory; repeat the command to continue, with fewer "
+            "--workers"
+        ) from error
     finally:
         for name, value in previous.items():
             if value is None:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+def _end_with_parent() -> None:
+    """Let this worker die when its parent is killed; it would wait for work, or write, forever."""
+    parent = multiprocessing.parent_process()
+    threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
 
 
 def _run_dask(tasks: list[ShardTask], scheduler: str) -> Iterator[ShardResult]:

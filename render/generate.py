@@ -8,18 +8,20 @@ checksums in a journal until the manifest replaces it.
 from __future__ import annotations
 
 import argparse
+import fcntl
 import importlib.metadata
 import json
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
 from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 
-from datamodules.atomic import remove_leftovers
-from datamodules.manifest import PROTOCOLS, SPLITS, VIEWS, Manifest, ManifestError, ShardEntry, set_folder
+from datamodules.atomic import atomic_write, remove_leftovers
+from datamodules.manifest import MANIFEST_NAME, PROTOCOLS, SPLITS, VIEWS, Manifest, ShardEntry, set_folder
 from datamodules.shards import sha256_of
 from render.category import CategorySpec, category_names, load_category
 from render.depth_renderer import DepthRenderer, RendererUnavailable
@@ -42,12 +44,26 @@ def generate(options: SetOptions, out: Path, workers: int, scheduler: str | None
     ids = split_instances(options)
     for split in SPLITS:
         (folder / split).mkdir(parents=True, exist_ok=True)
-        remove_leftovers(folder / split)
-    remove_leftovers(folder)
-    tasks = [task for split in SPLITS for task in plan_shards(options, folder, split, ids[split])]
-    if (folder / "manifest.json").exists():
-        _repair(folder, options, tasks, workers, scheduler)
-        return folder
+    with _alone_in(folder):
+        for place in (folder, *(folder / split for split in SPLITS)):
+            remove_leftovers(place)
+        tasks = [task for split in SPLITS for task in plan_shards(options, folder, split, ids[split])]
+        if (folder / MANIFEST_NAME).exists():
+            _repair(folder, options, tasks, workers, scheduler)
+        else:
+            _complete(folder, options, ids, tasks, workers, scheduler)
+    return folder
+
+
+def _complete(
+    folder: Path,
+    options: SetOptions,
+    ids: dict[str, tuple[str, ...]],
+    tasks: list[ShardTask],
+    workers: int,
+    scheduler: str | None,
+) -> None:
+    """Make the shards that the journal does not list as finished, then the manifest."""
     journal = Journal(folder / JOURNAL_NAME, options)
     done = {key: result for key, result in journal.read().items() if _intact(folder, result)}
     missing = [task for task in tasks if (task.split, task.name) not in done]
@@ -58,7 +74,19 @@ def generate(options: SetOptions, out: Path, workers: int, scheduler: str | None
     results = [done[task.split, task.name] for task in tasks]
     _manifest(options, ids, results).save(folder)
     journal.path.unlink()
-    return folder
+
+
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Hold the folder against other generators; a killed process lets go by itself."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    except BlockingIOError as error:
+        raise ValueError(f"{folder}: another run is making this set; wait for its end or pass another --out") from error
+    finally:
+        os.close(descriptor)
 
 
 def split_instances(options: SetOptions) -> dict[str, tuple[str, ...]]:
@@ -100,10 +128,10 @@ class Journal:
             ValueError: if another set was begun in this folder.
         """
         self.path = path
-        self._options = json.loads(json.dumps(_described(options)))
-        if not self._lines():
-            path.write_text(json.dumps(self._options) + "\n")
-        _require_same_options(self._lines()[0], self._options, path.parent)
+        lines = self._lines() or [_described(options)]
+        _require_same_options(lines[0], _described(options), path.parent)
+        with atomic_write(path) as file:  # without a line that a killed run left unfinished
+            file.writelines(json.dumps(line).encode() + b"\n" for line in lines)
 
     def append(self, result: ShardResult) -> None:
         """Note a finished shard."""
@@ -116,7 +144,7 @@ class Journal:
         return {(result.split, result.name): result for result in results}
 
     def _lines(self) -> list[dict]:
-        """All lines; one that a killed run left unfinished is not a line."""
+        """All complete lines."""
         if not self.path.exists():
             return []
         lines = []
@@ -134,7 +162,8 @@ def _tuples(value):
 
 
 def _described(options: SetOptions) -> dict:
-    return {"generator_version": generator_version(), **options.recorded()}
+    """The options as they come back from a JSON file."""
+    return json.loads(json.dumps({"generator_version": generator_version(), **options.recorded()}))
 
 
 def generator_version() -> str:
@@ -160,7 +189,7 @@ def _repair(folder: Path, options: SetOptions, tasks: list[ShardTask], workers: 
     """Make the missing and damaged shards of a finished set again."""
     manifest = Manifest.load(folder)
     found = {"generator_version": manifest.generator_version, **manifest.options}
-    _require_same_options(found, json.loads(json.dumps(_described(options))), folder)
+    _require_same_options(found, _described(options), folder)
     entries = {(split, shard.name): shard for split in SPLITS for shard in manifest.shards[split]}
     broken = [task for task in tasks if not _intact(folder, entries[task.split, task.name], task.split)]
     for result in _with_progress(run_tasks(broken, workers, scheduler), len(broken), options):
@@ -310,9 +339,12 @@ def main(argv: list[str] | None = None) -> int:
     try:
         folder = generate(options_from(arguments), arguments.out, arguments.workers, arguments.scheduler)
         manifest = Manifest.load(folder)
-    except (ValueError, OSError, ManifestError) as error:
+    except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("interrupted; repeat the command to continue", file=sys.stderr)
+        return 130
     counts = ", ".join(f"{manifest.num_samples(split)} {split}" for split in SPLITS)
     print(f"{folder}: {counts} samples")
     return 0

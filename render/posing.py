@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import qmc
 
 from render.articulated_object import ArticulatedObject
 
@@ -16,8 +15,9 @@ def sample_states(
 ) -> np.ndarray:  # [num_states, J]
     """Articulation states by Latin hypercube sampling: every joint alone covers its range [lower, upper) evenly."""
     lower, upper = np.array(ranges).reshape(-1, 2).T
-    unit = qmc.LatinHypercube(len(ranges), rng=rng).random(num_states)
-    return lower + unit * (upper - lower)
+    strata = np.array([rng.permutation(num_states) for _ in ranges]).reshape(-1, num_states).T  # [num_states, J]
+    share = (strata + rng.random(strata.shape)) / num_states
+    return lower + share * (upper - lower)
 
 
 def sample_rotation(rng: np.random.Generator) -> np.ndarray:  # [3, 3]

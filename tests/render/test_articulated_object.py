@@ -73,12 +73,12 @@ def _nan_mesh():
     ],
 )
 def test_unsound_objects_are_refused(make, message):
-    with pytest.raises(ValueError, match=f"instance 'box'.*{message}"):
+    with pytest.raises(ValueError, match=rf"instance 'box'.*{message}"):
         make().validate()
 
 
 def test_cyclic_trees_are_refused():
     chain = box_chain()
     slide, swing = chain.joints
-    with pytest.raises(ValueError, match="instance 'chain'.*cycle"):
+    with pytest.raises(ValueError, match=r"instance 'chain'.*cycle"):
         replace(chain, joints=(replace(slide, parent=2), swing)).validate()

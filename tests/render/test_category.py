@@ -41,7 +41,7 @@ def test_laptop_range_is_within_the_limits_of_the_hinge():
     stiff = replace(laptop, joints=(replace(laptop.joints[0], upper=pi / 4),))
     np.testing.assert_allclose(np.rad2deg(spec.sampled_ranges(stiff)), [[9, 45]])
     welded = replace(laptop, joints=(replace(laptop.joints[0], upper=0.1),))
-    with pytest.raises(ValueError, match="'box'.*'hinge'.*exclude the category's range"):
+    with pytest.raises(ValueError, match=r"'box'.*'hinge'.*exclude the category's range"):
         spec.sampled_ranges(welded)
 
 
@@ -62,5 +62,5 @@ def test_to_rest_moves_meshes_to_the_rest_state_of_the_category():
 
 
 def test_to_rest_refuses_objects_of_another_category():
-    with pytest.raises(ValueError, match="'box' has parts.*the category has parts"):
+    with pytest.raises(ValueError, match=r"'box' has parts.*the category has parts"):
         load_category("oven").to_rest(box_laptop())

@@ -77,7 +77,7 @@ def test_parts_that_no_sensor_reaches_are_refused():
     laptop = box_laptop()
     shell = trimesh.creation.box(extents=[2, 2, 2])
     enclosed = replace(laptop, meshes=(shell, laptop.meshes[1]))
-    with pytest.raises(ValueError, match="'box'.*no sensor reaches part 'lid'"):
+    with pytest.raises(ValueError, match=r"'box'.*no sensor reaches part 'lid'"):
         surface_of(enclosed, [[0.5]])
 
 

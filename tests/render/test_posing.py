@@ -52,7 +52,7 @@ def test_part_pose_takes_rest_points_to_the_normalised_cloud(posed):
 
 
 def test_part_centers_are_those_of_the_rest_boxes(posed):
-    chain, *_, scale, labels = posed
+    *_, scale, labels = posed
     np.testing.assert_allclose(labels["part_center"][0] * scale, [0, 0.15, 0], atol=1e-12)
     np.testing.assert_allclose(labels["part_center"][2] * scale, [0, 0.15, 0.32], atol=1e-12)
 

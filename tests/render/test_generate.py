@@ -1,0 +1,299 @@
+"""`python -m render.generate`: same bytes however they are made, resumable, and one clear message for bad input."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import multiprocessing
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import dask
+import numpy as np
+import pytest
+import torch
+from dask.distributed import LocalCluster
+
+from datamodules import atomic
+from datamodules.geometry import screw_motion, transform_points
+from datamodules.manifest import Manifest, set_folder
+from datamodules.shards import read_shard
+from datamodules.verify import verify_set
+from render.category import load_category
+from render.execution import run_tasks
+from render.generate import default_split, main
+
+SMALL = ["--states", "3", "--rotations", "2", "--views", "2", "--points", "64", "--resolution", "64"]
+
+
+def make(out: Path, *options: str, train: int = 2, test: int = 1, category: str = "laptop") -> Path:
+    """Make a small set in this process and return its folder."""
+    counts = ["--train-instances", str(train), "--test-instances", str(test)]
+    view = "partial" if "partial" in options else "complete"
+    assert main(["--category", category, "--out", str(out), "--workers", "1", *counts, *SMALL, *options]) == 0
+    protocol = ("eap" if "eap" in options else "honest") if view == "partial" else None
+    return set_folder(out, category, "procedural", view, protocol)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file of a set."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.fixture(scope="module")
+def complete_set(tmp_path_factory) -> Path:
+    return make(tmp_path_factory.mktemp("complete"))
+
+
+def test_splits_hold_what_was_asked_for(complete_set):
+    manifest = Manifest.load(complete_set)
+    assert manifest.instances == {"train": ("laptop-0000", "laptop-0001"), "test": ("laptop-0002",)}
+    assert (manifest.num_samples("train"), manifest.num_samples("test")) == (2 * 3, 1 * 3 * 2)
+    assert manifest.part_names == ("base", "lid")
+    np.testing.assert_allclose(np.rad2deg(manifest.articulation_range), [[9 - 90, 99 - 90]])
+    assert sorted(contents(complete_set)) == sorted(
+        ["manifest.json", "test/shard-00000.npz", "train/shard-00000.npz", "train/shard-00001.npz"]
+    )
+
+
+def test_training_clouds_are_stored_once_unrotated_and_test_clouds_rotated(complete_set):
+    train = read_shard(complete_set / "train" / "shard-00000.npz")
+    test = read_shard(complete_set / "test" / "shard-00000.npz")
+    np.testing.assert_array_equal(train["object_rotation"], np.broadcast_to(np.eye(3), (3, 3, 3)))
+    assert len(np.unique(test["object_rotation"].reshape(6, 9), axis=0)) == 6
+    assert len(np.unique(test["joint_state"])) == 3
+
+
+@pytest.mark.parametrize(
+    ("category", "options"),
+    [
+        ("laptop", []),
+        ("eyeglasses", ["--view", "partial"]),
+        ("drawer", []),
+        ("drawer", ["--view", "partial", "--protocol", "eap"]),
+        ("oven", ["--view", "partial", "--renderer", "ray-caster", "--noise-std", "0.001"]),
+        ("safe", []),
+        ("washing_machine", ["--view", "partial"]),
+        ("laptop_real", []),
+    ],
+)
+def test_generated_sets_pass_verification(tmp_path, category, options):
+    assert verify_set(make(tmp_path, *options, train=1, category=category)) == []
+
+
+def test_moving_a_part_about_its_joint_lands_on_the_cloud_of_another_state(complete_set):
+    """Every point of one state's cloud, moved by the state difference, lies on the surface the other cloud samples."""
+    shard = {
+        name: torch.tensor(array) for name, array in read_shard(complete_set / "train" / "shard-00000.npz").items()
+    }
+    pose = shard["part_pose"].double()
+    a, b = 0, 1
+    lid = shard["part_id"][a] == 1
+    difference = (shard["joint_state"][b] - shard["joint_state"][a])[0].double()
+    axis, pivot = shard["joint_axis"][a, 0].double(), shard["joint_pivot"][a, 0].double()
+    moved = transform_points(screw_motion(axis, pivot, difference, 0), shard["points"][a][lid].double())
+    base_motion = pose[b, 0] @ torch.linalg.inv(pose[a, 0])
+    in_other = transform_points(base_motion, moved)
+    rest = transform_points(torch.linalg.inv(pose[b, 1]), in_other)
+    expected = transform_points(torch.linalg.inv(pose[a, 1]), shard["points"][a][lid].double())
+    torch.testing.assert_close(rest, expected, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(("workers", "options"), [("2", ["--view", "partial"]), ("3", [])])
+def test_bytes_do_not_depend_on_the_number_of_workers(tmp_path, workers, options):
+    expected = contents(make(tmp_path / "1", *options))
+    assert contents(make(tmp_path / workers, *options, "--workers", workers)) == expected
+
+
+def test_another_seed_gives_other_bytes(tmp_path, complete_set):
+    assert (
+        contents(make(tmp_path, "--seed", "1"))["train/shard-00000.npz"]
+        != contents(complete_set)["train/shard-00000.npz"]
+    )
+
+
+def test_dask_makes_the_same_bytes(tmp_path, complete_set):
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, processes=False) as cluster:
+        folder = make(tmp_path, "--scheduler", cluster.scheduler_address)
+    assert contents(folder) == contents(complete_set)
+
+
+def test_unreachable_scheduler_is_a_clear_error(tmp_path, capsys):
+    with dask.config.set({"distributed.comm.timeouts.connect": "1s"}):
+        code = main(["--category", "laptop", "--out", str(tmp_path), "--scheduler", "tcp://127.0.0.1:1", *SMALL])
+    assert code == 2 and "tcp://127.0.0.1:1" in capsys.readouterr().err
+
+
+def test_killed_runs_resume_to_the_same_bytes(tmp_path):
+    """SIGKILL at several moments; no file under a final name is ever half written."""
+    expected = contents(make(tmp_path / "whole", "--points", "512", train=6))
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["render.generate", "render.sources.procedural"])
+    folder, kills = None, 0
+    for delay in (0.05, 0.15, 0.3, 0.6):
+        process = context.Process(target=make, args=(tmp_path / "killed", "--points", "512"), kwargs={"train": 6})
+        process.start()
+        folder = set_folder(tmp_path / "killed", "laptop")
+        wait_for(folder / ".journal.jsonl", process)
+        time.sleep(delay)
+        if process.is_alive():
+            os.kill(process.pid, signal.SIGKILL)
+            kills += 1
+        process.join()
+        found = contents(folder)
+        assert all(found[name] == expected[name] for name in found if not Path(name).name.startswith("."))
+    assert kills > 0
+    make(tmp_path / "killed", "--points", "512", train=6)
+    assert contents(folder) == expected, "and nothing else is left behind"
+
+
+def wait_for(path: Path, process: multiprocessing.Process) -> None:
+    """Until a file appears, or the process that should write it has ended."""
+    while process.is_alive() and not path.exists():
+        time.sleep(0.01)
+
+
+def test_two_runs_in_one_folder_are_refused(tmp_path, capsys):
+    folder = set_folder(tmp_path, "laptop")
+    folder.mkdir(parents=True)
+    descriptor = os.open(folder, os.O_RDONLY)
+    fcntl.flock(descriptor, fcntl.LOCK_EX)
+    assert main(["--category", "laptop", "--out", str(tmp_path), *SMALL]) == 2
+    assert "another run is making this set" in capsys.readouterr().err
+    os.close(descriptor)
+
+
+def test_a_killed_worker_is_a_clear_error(tmp_path):
+    tasks = [KillingTask()] * 2
+    with pytest.raises(ChildProcessError, match="worker process was killed"):
+        list(run_tasks(tasks, workers=2))
+
+
+class KillingTask:
+    """Ends the worker that unpacks it, as the kernel does when memory runs out."""
+
+    def __reduce__(self):
+        return os._exit, (9,)
+
+
+def test_an_unfinished_set_keeps_what_is_done(tmp_path, complete_set, monkeypatch):
+    """Only the shards that are missing or damaged are made again."""
+    folder = set_folder(tmp_path, "laptop")
+    shutil.copytree(complete_set, folder)
+    shard = folder / "train" / "shard-00001.npz"
+    shard.write_bytes(shard.read_bytes()[:-1])
+    (folder / "test" / "shard-00000.npz").unlink()
+    untouched = (folder / "train" / "shard-00000.npz").stat().st_mtime_ns
+    make(tmp_path)
+    assert contents(folder) == contents(complete_set)
+    assert (folder / "train" / "shard-00000.npz").stat().st_mtime_ns == untouched
+
+
+def test_a_torn_journal_line_is_made_again(tmp_path, complete_set):
+    make(tmp_path)
+    folder = set_folder(tmp_path, "laptop")
+    manifest = json.loads((folder / "manifest.json").read_text())
+    (folder / "manifest.json").unlink()
+    header = {"generator_version": manifest["generator_version"], **manifest["options"]}
+    (folder / ".journal.jsonl").write_text(json.dumps(header) + '\n{"split": "train", "na')
+    (folder / "train" / ".shard-00000.npz.0123.tmp").write_bytes(b"left by a killed run")
+    make(tmp_path)
+    assert contents(folder) == contents(complete_set)
+
+
+def test_other_options_in_the_same_folder_are_refused(tmp_path, complete_set, capsys):
+    out = complete_set.parents[1]
+    before = contents(complete_set)
+    assert main(["--category", "laptop", "--out", str(out), "--seed", "5", *SMALL]) == 2
+    message = capsys.readouterr().err
+    assert str(complete_set) in message and "seed 0, now 5" in message and "delete that folder" in message
+    assert contents(complete_set) == before
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--category", "toaster"], "invalid choice: 'toaster'"),
+        (["--category", "laptop", "--states", "0"], "must be at least 1"),
+        (["--category", "laptop", "--states", "many"], "invalid integer value: 'many'"),
+        (["--category", "laptop", "--noise-std", "-1"], "--noise-std must be in [0, 1)"),
+        (["--category", "laptop", "--noise-std", "nan"], "--noise-std must be in [0, 1)"),
+        (["--category", "laptop", "--root", "somewhere"], "takes no --root"),
+        (["--category", "laptop", "--source", "urdf"], "needs a --root"),
+        (["--category", "laptop", "--source", "urdf", "--root", "/no/such/folder"], "/no/such/folder"),
+        (["--category", "laptop", "--train-instances", "0", "--test-instances", "0"], "nothing to make"),
+        (["--category", "laptop", "--train-instances", "99999999"], "has 10000 instances"),
+        (["--category", "laptop", "--points", "999999"], "cannot choose 999999"),
+    ],
+)
+def test_bad_arguments_exit_with_2_and_one_message(tmp_path, capsys, options, message):
+    try:
+        code = main([*options, "--out", str(tmp_path), "--workers", "1"])
+    except SystemExit as exit:
+        code = exit.code
+    assert code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_output_that_cannot_be_written(tmp_path, capsys):
+    (tmp_path / "file").write_text("not a folder")
+    assert main(["--category", "laptop", "--out", str(tmp_path / "file"), *SMALL]) == 2
+    assert str(tmp_path / "file") in capsys.readouterr().err
+
+
+def test_full_disk_keeps_what_is_done_and_can_be_continued(tmp_path, complete_set, monkeypatch, capsys):
+    fsync, calls = os.fsync, []
+
+    def full_after_one(descriptor):
+        calls.append(descriptor)
+        if len(calls) > 1:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        fsync(descriptor)
+
+    monkeypatch.setattr(atomic.os, "fsync", full_after_one)
+    folder = set_folder(tmp_path, "laptop")
+    options = [
+        "--category",
+        "laptop",
+        "--out",
+        str(tmp_path),
+        "--train-instances",
+        "2",
+        "--test-instances",
+        "1",
+        *SMALL,
+    ]
+    assert main([*options, "--workers", "1"]) == 2
+    assert "No space left on device" in capsys.readouterr().err
+    shards = {name for name in contents(folder) if name.endswith(".npz")}
+    assert shards == {"train/shard-00000.npz"} and not (folder / "manifest.json").exists()
+    monkeypatch.undo()
+    make(tmp_path)
+    assert contents(folder) == contents(complete_set)
+
+
+def test_without_egl_the_ray_caster_takes_over_and_says_so(tmp_path):
+    """PyOpenGL is pointed to a platform that is not installed, as where libEGL is missing."""
+    environment = os.environ | {"PYOPENGL_PLATFORM": "osmesa"}
+    command = [sys.executable, "-m", "render.generate", "--category", "laptop", "--view", "partial", *SMALL]
+    command += ["--workers", "1", "--train-instances", "1", "--test-instances", "0", "--out", str(tmp_path)]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    assert run.returncode == 0, run.stderr
+    assert "no offscreen OpenGL" in run.stderr and "ray caster" in run.stderr
+    folder = set_folder(tmp_path, "laptop", "procedural", "partial", "honest")
+    assert Manifest.load(folder).options["renderer"] == "ray-caster"
+    run = subprocess.run([*command, "--renderer", "egl"], env=environment, capture_output=True, text=True, timeout=120)
+    assert run.returncode == 2 and "--renderer ray-caster" in run.stderr and "Traceback" not in run.stderr
+
+
+@pytest.mark.parametrize(
+    ("available", "expected"), [(100, (73, 9)), (82, (73, 9)), (41, (37, 4)), (2, (1, 1)), (1, (0, 1))]
+)
+def test_small_collections_are_split_in_the_same_ratio(available, expected):
+    assert default_split(load_category("laptop"), available) == expected
