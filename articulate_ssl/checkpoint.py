@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 
 from articulate_ssl import options
-from articulate_ssl.inference.checkpoint_file import CHECKPOINT_KEY, CheckpointError, read_checkpoint
+from articulate_ssl.inference.checkpoint_file import CheckpointError, read_checkpoint
 from articulate_ssl.module import ArticulatedPoseModule
 
 _GROUPS = {
@@ -25,7 +25,6 @@ def load_module(path: str | os.PathLike) -> ArticulatedPoseModule:
     """
     content = read_checkpoint(path)
     plain = dict(content["hyper_parameters"])
-    num_points = plain.pop("num_points", None)
     try:
         arguments = {name: _GROUPS[name](**value) if name in _GROUPS else value for name, value in plain.items()}
         module = ArticulatedPoseModule(**arguments)
@@ -35,7 +34,5 @@ def load_module(path: str | os.PathLike) -> ArticulatedPoseModule:
         raise CheckpointError(
             f"{path}: does not fit this version of articulate-ssl ({problem}); train again, or use the version it was made with"
         ) from error
-    if num_points is not None:
-        module.hparams["num_points"] = num_points
-    module.registered = content[CHECKPOINT_KEY].get("registered")
+    module.on_load_checkpoint(content)
     return module.eval()

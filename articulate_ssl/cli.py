@@ -74,11 +74,11 @@ def _learn(arguments: list[str]) -> int:
         def before_validate(self) -> None:
             self._use_checkpoint("validate")
 
+    sys.argv = [sys.argv[0], *arguments]
     try:
         ArticulateCLI(
             ArticulatedPoseModule,
             ArticulatedDataModule,
-            args=arguments,
             seed_everything_default=0,
             save_config_kwargs={"overwrite": True},
         )

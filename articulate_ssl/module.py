@@ -110,7 +110,9 @@ class ArticulatedPoseModule(LightningModule):
             shared_axis=network.shared_axis,
         )
         self.rigid = (
-            RigidAlignment(self._backbone(), group, network.dims[-1], network.head_dim, num_parts * network.shape_points)
+            RigidAlignment(
+                self._backbone(), group, network.dims[-1], network.head_dim, num_parts * network.shape_points
+            )
             if schedule.rigid_steps
             else None
         )
@@ -119,12 +121,11 @@ class ArticulatedPoseModule(LightningModule):
         self.register_buffer("radius_square", torch.tensor(0.0))
         self.register_buffer("state_limits", torch.zeros(num_parts - 1, 2))
         self.registered: dict[str, Tensor] | None = None
+        self.num_points = 512  # of a training cloud; a scan is thinned to as many
 
     def _backbone(self) -> EquivariantBackbone:
         n = self.network_options
-        return EquivariantBackbone(
-            n.group_order, n.dims, n.radii, n.num_neighbors, n.num_kernel_points, n.num_centers
-        )
+        return EquivariantBackbone(n.group_order, n.dims, n.radii, n.num_neighbors, n.num_kernel_points, n.num_centers)
 
     # Pose estimation
 
@@ -266,11 +267,6 @@ class ArticulatedPoseModule(LightningModule):
         return prediction[best : best + 1], center, scales[best], batch[best].cpu().numpy()
 
     @property
-    def num_points(self) -> int:
-        """Points that a scan is thinned to: as many as a training cloud had."""
-        return int(self.hparams.get("num_points", 512))
-
-    @property
     def state_range(self) -> Tensor:
         """[J, 2] lowest and highest joint state seen in training."""
         return self.state_limits
@@ -306,7 +302,7 @@ class ArticulatedPoseModule(LightningModule):
 
     def on_train_start(self) -> None:
         """Remember how many points a cloud has."""
-        self.hparams["num_points"] = self.trainer.datamodule.hparams.num_points
+        self.num_points = self.trainer.datamodule.hparams.num_points
 
     def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """One step of whichever stage the schedule is in."""
@@ -354,7 +350,9 @@ class ArticulatedPoseModule(LightningModule):
         device = self.device
         generator = torch.Generator().manual_seed(hash((self.global_step, self.global_rank)) % 2**31)
         index = torch.randint(len(self.registered["points"]), (size,), generator=generator)
-        rotation = roma.unitquat_to_rotmat(torch.nn.functional.normalize(torch.randn(size, 4, generator=generator), dim=-1))
+        rotation = roma.unitquat_to_rotmat(
+            torch.nn.functional.normalize(torch.randn(size, 4, generator=generator), dim=-1)
+        )
         turn = se3(rotation, torch.zeros(size, 3)).to(device)
         points, base, state = (self.registered[name][index].to(device) for name in ("points", "base", "state"))
         aligned, pose = self.align(transform_points(turn, points))
@@ -442,7 +440,9 @@ class ArticulatedPoseModule(LightningModule):
         pose = found.part_pose()[best]
         nearest = torch.cdist(dense[best], found.template.posed(found.part_pose()[best : best + 1])[0]).argmin(dim=1)
         label = found.template.label[nearest]
-        canonical = torch.einsum("kij,nj->kni", invert_se3(pose)[:, :3, :3], dense[best]) + invert_se3(pose)[:, None, :3, 3]
+        canonical = (
+            torch.einsum("kij,nj->kni", invert_se3(pose)[:, :3, :3], dense[best]) + invert_se3(pose)[:, None, :3, 3]
+        )
         for part in range(self.num_parts):
             points = canonical[part, label == part].cpu().numpy()
             order = farthest_point_order(points, min(len(points), net.shape_points))
@@ -463,12 +463,12 @@ class ArticulatedPoseModule(LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Mark the checkpoint as ours and keep the registered clouds, so that training resumes without discovery."""
-        checkpoint[CHECKPOINT_KEY] = {"version": 1, "registered": self.registered}
-        checkpoint["hyper_parameters"] = dict(self.hparams)
+        checkpoint[CHECKPOINT_KEY] = {"version": 1, "num_points": self.num_points, "registered": self.registered}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take the registered clouds back."""
-        self.registered = checkpoint[CHECKPOINT_KEY]["registered"]
+        """Take them back."""
+        own = checkpoint[CHECKPOINT_KEY]
+        self.num_points, self.registered = own["num_points"], own["registered"]
 
     # Validation and test
 

@@ -1,4 +1,4 @@
-"""What `lightning test` collects and writes: calibrated metrics, timing, and a picture of best, median and worst clouds."""
+"""What `lightning test` collects and writes: calibrated metrics, timing, and a picture of typical clouds."""
 
 from __future__ import annotations
 
@@ -52,7 +52,9 @@ class TestReport:
         self.metrics.update(prediction, batch)
         self.seconds += seconds
         nearest = torch.cdist(batch["points"], batch["dense_points"]).argmin(dim=-1)
-        self.samples.append((batch["points"].cpu(), batch["dense_part_id"].gather(1, nearest).cpu(), prediction.to("cpu")))
+        self.samples.append(
+            (batch["points"].cpu(), batch["dense_part_id"].gather(1, nearest).cpu(), prediction.to("cpu"))
+        )
 
     def write(self, folder: Path, manifest: Manifest, checkpoint: str, refined: bool) -> dict:
         """Write metrics.json, metrics.csv and the picture; print the table.

@@ -101,8 +101,6 @@ class ArticulatedNetwork(nn.Module):
         axis: [E, 3] and pivot: [E, 3] category-level joint lines of the part pairs.
         confidence: [E] category-level adjacency.
         principal_axes: [K, 3, 3] columns along which instances stretch a part.
-        motion_share: [J] share of each joint's motion that the base takes in the aligned frame (design: shared motion).
-        flow_gain: how much of the per-point instance flow is switched on, 0..1.
         mean_confidence: [E] running mean of the predicted adjacency confidences, from which the chain is extracted.
     """
 
@@ -157,8 +155,6 @@ class ArticulatedNetwork(nn.Module):
         self.pivot = nn.Parameter(torch.zeros(len(pairs), 3))
         self.confidence = nn.Parameter(torch.zeros(len(pairs)))
         self.register_buffer("principal_axes", torch.eye(3).repeat(num_parts, 1, 1))
-        self.register_buffer("motion_share", torch.zeros(num_parts - 1))
-        self.register_buffer("flow_gain", torch.tensor(1.0))
         self.register_buffer("mean_confidence", torch.zeros(len(pairs)))
 
     def chain(self) -> KinematicChain:
@@ -200,7 +196,7 @@ class ArticulatedNetwork(nn.Module):
         if self.shared_axis:
             axis = axis[:, :, :1].expand_as(axis)
         state = self._states(equivariant, chain)
-        base = self._base(equivariant, chain, axis, pivot, state, mean)
+        base = self._base(equivariant, chain, mean)
         if estimate is not None:
             state = estimate.state.detach() + state
             base = estimate.base.detach() @ base
@@ -219,7 +215,7 @@ class ArticulatedNetwork(nn.Module):
         stretch = (self.stretch_bound * stretch.tanh()).exp()
         along = self.principal_axes * stretch[..., None, :]
         shape = torch.einsum("bkij,klj,kml->bkmi", along, self.principal_axes, self.template)
-        shape = shape + self.flow_gain * self.flow_bound * flow.unflatten(-1, (-1, 3)).tanh()
+        shape = shape + self.flow_bound * flow.unflatten(-1, (-1, 3)).tanh()
         return shape, self.assembly + shift
 
     def _pairs(self, invariant: Tensor) -> tuple[Tensor, Tensor]:
@@ -239,15 +235,8 @@ class ArticulatedNetwork(nn.Module):
         state = [self.state_head[k](equivariant[:, k]).float()[..., 0] for k in chain.child]
         return self.state_bound * torch.stack(state, dim=-1).tanh()
 
-    def _base(
-        self, equivariant: Tensor, chain: KinematicChain, axis: Tensor, pivot: Tensor, state: Tensor, mean: Tensor
-    ) -> Tensor:
-        """Base transformation hypotheses [B, G, 4, 4]: group element x predicted residual x the base's motion share."""
+    def _base(self, equivariant: Tensor, chain: KinematicChain, mean: Tensor) -> Tensor:
+        """Base transformation hypotheses [B, G, 4, 4]: group element x predicted residual, about the cloud's mean."""
         residual = self.base_head[chain.root](equivariant[:, chain.root]).float()
         translation = torch.einsum("gij,bgj->bgi", self.elements, residual[..., 3:]) + mean
-        base = se3(self.elements @ roma.rotvec_to_rotmat(residual[..., :3]), translation)
-        for j in range(len(chain.child)):
-            share = -self.motion_share[j] * state[..., j]
-            line = axis[..., j, :], pivot[:, None, j].expand_as(axis[..., j, :])
-            base = base @ screw_motion(*line, share, self.joint_type)
-        return base
+        return se3(self.elements @ roma.rotvec_to_rotmat(residual[..., :3]), translation)

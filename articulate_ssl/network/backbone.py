@@ -68,7 +68,7 @@ class GroupConvolutionBlock(nn.Module):
         neighborhood: Neighborhood,  # its M centres are the leading points
     ) -> Tensor:  # [B, M, G, C']
         out = group_convolution(features, neighborhood, self.weight, self.permutation)
-        out = leaky_relu(self.norm(out), negative_slope=0.01)
+        out = leaky_relu(self.norm(out), negative_slope=0.01, inplace=True)
         if self.intra is None:
             return out
         B, M, G, _ = out.shape

@@ -33,7 +33,13 @@ class RigidAlignment(nn.Module):
     """Whole-shape EPN auto-encoder: invariant canonical shape, one residual rotation and translation per group element."""
 
     def __init__(
-        self, backbone: nn.Module, group: RotationGroup, in_dim: int, dim: int, shape_points: int, flow_bound: float = 0.05
+        self,
+        backbone: nn.Module,
+        group: RotationGroup,
+        in_dim: int,
+        dim: int,
+        shape_points: int,
+        flow_bound: float = 0.05,
     ) -> None:
         """Args: feature backbone with `in_dim` output channels; hidden width; points of the canonical shape; flow bound."""
         super().__init__()

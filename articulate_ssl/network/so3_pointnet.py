@@ -18,7 +18,11 @@ class SO3PointNet(nn.Module):
         super().__init__()
         self.register_buffer("elements", elements.float(), persistent=False)
         self.perceptron = nn.Sequential(
-            nn.Linear(in_dim + 3, out_dim), nn.LayerNorm(out_dim), nn.LeakyReLU(0.1), nn.Linear(out_dim, out_dim), nn.ReLU()
+            nn.Linear(in_dim + 3, out_dim),
+            nn.LayerNorm(out_dim),
+            nn.LeakyReLU(0.1),
+            nn.Linear(out_dim, out_dim),
+            nn.ReLU(),
         )
 
     def forward(

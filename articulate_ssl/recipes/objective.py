@@ -74,9 +74,7 @@ def paper_terms(winner: Hypotheses, points: Tensor, options: ObjectiveOptions) -
     return Terms(loss, reconstruction, joints, zero, zero, association)
 
 
-def staged_terms(
-    selected: Hypotheses, points: Tensor, options: ObjectiveOptions, target: PoseTarget | None
-) -> Terms:
+def staged_terms(selected: Hypotheses, points: Tensor, options: ObjectiveOptions, target: PoseTarget | None) -> Terms:
     """Part-by-part reconstruction under the posterior association, L_reg, and two teachers that registration gives.
 
     The posterior (which posed part explains a point) weights the reconstruction and teaches the part proposal; poses are

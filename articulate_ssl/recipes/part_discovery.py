@@ -31,7 +31,7 @@ from articulate_ssl.registration import (
     search_articulated,
     update_poses,
 )
-from datamodules.geometry import PRISMATIC, REVOLUTE, invert_se3, screw_motion, se3, transform_points
+from datamodules.geometry import PRISMATIC, invert_se3, screw_motion, se3, transform_points
 
 log = logging.getLogger(__name__)
 
@@ -43,6 +43,7 @@ class DiscoveryOptions:
     Attributes:
         clouds: Training clouds that are registered.
         split_clouds: The best aligned of them, on which splits are tried.
+        search_clouds: Those on which labels and joints are solved again; all are registered in the end.
         points: Points per cloud and template in registration.
         starts: Random splits.
         rounds: Rounds of articulated search, relabelling and joint fitting.
@@ -53,6 +54,7 @@ class DiscoveryOptions:
 
     clouds: int = 192
     split_clouds: int = 48
+    search_clouds: int = 96
     points: int = 256
     starts: int = 12
     rounds: int = 3
@@ -102,23 +104,24 @@ def discover(
     reference = clouds[choose_reference(clouds)]
     rotations = rotation_group(60).elements.to(clouds)
     coarse = max(64, options.points // 2)
-    rigid, error = register_rigid(reference[:coarse], clouds[:, :coarse], rotations, keep=1)
+    few = clouds[:: max(1, len(clouds) // options.search_clouds)][: options.search_clouds]
+    rigid, error = register_rigid(reference[:coarse], few[:, :coarse], rotations, keep=1)
     log.info("rigid alignment: median Chamfer-L1 %.4f", error[:, 0].median())
 
     best_aligned = error[:, 0].argsort()[: options.split_clouds]
-    aligned = transform_points(invert_se3(rigid[best_aligned, 0]), clouds[best_aligned])
+    aligned = transform_points(invert_se3(rigid[best_aligned, 0]), few[best_aligned])
     found = split_template(aligned, reference, num_parts, joint_type, options)
     log.info("best split of %d starts: Chamfer-L1 %.4f", options.starts, found.error.mean())
 
     for step in range(options.rounds):
-        base, state, error = _search(found, clouds, rotations)
-        kept = error.argsort()[: int(options.keep * len(clouds))]
+        base, state, error = _search(found, few, rotations)
+        kept = error.argsort()[: int(options.keep * len(few))]
         pose = found.joints.part_pose(base[kept], state[kept])
         template = found.template
         for scale in (0.03, 0.028, 0.026, 0.024, 0.022, 0.02):
-            pose = update_poses(template, pose, clouds[kept], scale)
-            template = relabel(template, pose, clouds[kept], cap=4 * scale)
-        found = fit_joints(template, pose, clouds[kept], joint_type)
+            pose = update_poses(template, pose, few[kept], scale)
+            template = relabel(template, pose, few[kept], cap=4 * scale)
+        found = fit_joints(template, pose, few[kept], joint_type)
         log.info("round %d: Chamfer-L1 %.4f of the kept clouds", step + 1, found.error.mean())
     base, state, error = _search(found, clouds, rotations)
     return replace(found, base=base, state=state, error=error)
@@ -240,17 +243,6 @@ def fit_joints(
     base = pose[:, chain.root] @ invert_se3(frame)
     error = chamfer_l1(clouds, template.posed(joints.part_pose(base, state)))
     return ArticulatedTemplate(template, joints, base, state, error)
-
-
-def motion_share(found: ArticulatedTemplate, centered: Tensor) -> Tensor:
-    """[J] share of each joint's motion that the base takes relative to `centered` [n, 4, 4], the clouds' own frames."""
-    relative = invert_se3(centered) @ found.base
-    if found.joints.joint_type == REVOLUTE:
-        moved = roma.rotmat_to_rotvec(relative[:, :3, :3])
-    else:
-        moved = relative[:, :3, 3] - relative[:, :3, 3].mean(dim=0)
-    slope = torch.linalg.lstsq(found.state, moved).solution  # [J, 3]
-    return -(slope * found.joints.axis).sum(dim=1)
 
 
 def _principal_frame(points: Tensor) -> Tensor:
