@@ -32,7 +32,8 @@ def load_module(path: str | os.PathLike) -> ArticulatedPoseModule:
     except (TypeError, ValueError, RuntimeError) as error:
         problem = str(error).splitlines()[0]
         raise CheckpointError(
-            f"{path}: does not fit this version of articulate-ssl ({problem}); train again, or use the version it was made with"
+            f"{path}: does not fit this version of articulate-ssl ({problem}); "
+            "train again, or use the version it was made with"
         ) from error
     module.on_load_checkpoint(content)
     return module.eval()

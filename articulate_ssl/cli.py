@@ -57,7 +57,8 @@ def _learn(arguments: list[str]) -> int:
                 found = sorted(folder.glob("**/last.ckpt"), key=lambda p: p.stat().st_mtime)
                 if not found:
                     raise CheckpointError(
-                        f"lightning {subcommand}: no checkpoint under {folder}; run `lightning fit -c …` first, or pass --ckpt_path"
+                        f"lightning {subcommand}: no checkpoint under {folder}; "
+                        "run `lightning fit -c …` first, or pass --ckpt_path"
                     )
                 options["ckpt_path"] = str(found[-1])
             path = options["ckpt_path"]

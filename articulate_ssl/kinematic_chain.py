@@ -66,8 +66,8 @@ def edge_marginals(
 ) -> Tensor:  # [..., E]
     """Probability that each edge is in a spanning tree drawn with weight exp(sum of its confidences).
 
-    Matrix-tree theorem: the partition function Z is a minor of the weighted graph Laplacian, and the marginal of an edge
-    is d log Z / d confidence = weight x effective resistance. Differentiable; sums to K - 1 over the edges.
+    Matrix-tree theorem: the partition function Z is a minor of the weighted graph Laplacian, and the marginal of an
+    edge is d log Z / d confidence = weight x effective resistance. Differentiable; sums to K - 1 over the edges.
     """
     pairs = pair_index(num_parts).to(confidence.device)
     weight = (confidence - confidence.amax(dim=-1, keepdim=True)).exp().clamp_min(1e-6)

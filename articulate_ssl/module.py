@@ -116,7 +116,7 @@ class ArticulatedPoseModule(LightningModule):
             if schedule.rigid_steps
             else None
         )
-        # Mean distance of a cloud's points to their centre, over training clouds: how a scan of unknown scale is scaled.
+        # Of training clouds' mean distance to their centre: how a scan of unknown scale is scaled.
         self.register_buffer("radius_mean", torch.tensor(0.0))
         self.register_buffer("radius_square", torch.tensor(0.0))
         self.register_buffer("state_limits", torch.zeros(num_parts - 1, 2))
@@ -251,7 +251,7 @@ class ArticulatedPoseModule(LightningModule):
         points: np.ndarray,  # [N, 3] any unit and origin
         refine: bool | None = None,
     ) -> tuple[Prediction, np.ndarray, float, np.ndarray]:
-        """Predict a scan of unknown scale: several scales within the training clouds' range, the best reconstruction wins.
+        """Predict a scan of unknown scale: of several within the training clouds' range, the best reconstruction wins.
 
         Returns:
             The prediction (B = 1), centre [3] and scale of the normalisation, and the normalised points it labels.

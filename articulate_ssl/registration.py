@@ -7,7 +7,7 @@ leading axis as independent problems.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import roma
 import torch

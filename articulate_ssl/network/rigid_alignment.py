@@ -30,7 +30,7 @@ class RigidHypotheses(NamedTuple):
 
 
 class RigidAlignment(nn.Module):
-    """Whole-shape EPN auto-encoder: invariant canonical shape, one residual rotation and translation per group element."""
+    """Whole-shape EPN auto-encoder: an invariant canonical shape, and one residual pose per group element."""
 
     def __init__(
         self,
@@ -41,7 +41,7 @@ class RigidAlignment(nn.Module):
         shape_points: int,
         flow_bound: float = 0.05,
     ) -> None:
-        """Args: feature backbone with `in_dim` output channels; hidden width; points of the canonical shape; flow bound."""
+        """Args: backbone with `in_dim` output channels; hidden width; points of the canonical shape; flow bound."""
         super().__init__()
         elements = torch.as_tensor(group.elements).float()
         self.register_buffer("elements", elements, persistent=False)

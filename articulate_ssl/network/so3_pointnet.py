@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 
 class SO3PointNet(nn.Module):
-    """Part features from point features: a shared perceptron on (feature, A_g^T x), then a maximum over a part's points.
+    """Part features from point features: a perceptron on (feature, A_g^T x), then a maximum over a part's points.
 
     Output channel (k, g) is the response of part k to the cloud as seen from group element g, so rotating the cloud by
     a group element permutes g, like the backbone's features.

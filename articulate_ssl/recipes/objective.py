@@ -77,9 +77,9 @@ def paper_terms(winner: Hypotheses, points: Tensor, options: ObjectiveOptions) -
 def staged_terms(selected: Hypotheses, points: Tensor, options: ObjectiveOptions, target: PoseTarget | None) -> Terms:
     """Part-by-part reconstruction under the posterior association, L_reg, and two teachers that registration gives.
 
-    The posterior (which posed part explains a point) weights the reconstruction and teaches the part proposal; poses are
-    drawn to registered ones, measured on the points they move. Segmentation weighting its own reconstruction collapses:
-    one slot takes every point within a few hundred steps.
+    The posterior (which posed part explains a point) weights the reconstruction and teaches the part proposal; poses
+    are drawn to registered ones, measured on the points they move. Segmentation weighting its own reconstruction
+    collapses: one slot takes every point within a few hundred steps.
     """
     posed = selected.posed()[:, 0]
     to_part = distances_to_parts(points, posed)

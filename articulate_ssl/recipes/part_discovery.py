@@ -1,10 +1,10 @@
 """Part discovery: find a category's parts and joints from unlabelled clouds alone, by registration.
 
 1. *Rigid alignment*: one typical cloud is registered to all others from every group rotation.
-2. *Splits*: cut the typical cloud into K pieces at random, register every piece to every aligned cloud on its own, and give
-   each template point to the piece whose motion explains it best in all clouds: points that move together end up
-   together. Of many random cuts the winner is the one that reconstructs best *after* each pair's relative motion has been
-   reduced to one joint, which is what a wrong split cannot survive.
+2. *Splits*: cut the typical cloud into K pieces at random, register every piece to every aligned cloud on its own, and
+   give each template point to the piece whose motion explains it best in all clouds: points that move together end up
+   together. Of many random cuts the winner is the one that reconstructs best *after* each pair's relative motion has
+   been reduced to one joint, which is what a wrong split cannot survive.
 3. *Rounds*: search every cloud again with the articulated template, from many orientations (this is what rights clouds
    that the rigid template fitted upside down), then solve labels and joints again from the clouds that fit.
 
@@ -205,7 +205,7 @@ def fit_joints(
     clouds: Tensor,  # [n, N, 3]
     joint_type: int,
 ) -> ArticulatedTemplate:
-    """Reduce free part poses to a tree of one-degree-of-freedom joints, in the canonical object space described above."""
+    """Reduce free part poses to a tree of one-degree-of-freedom joints, in canonical object space (see above)."""
     num_parts = template.num_parts
     gaps = []
     for i, j in pair_index(num_parts).tolist():
@@ -222,7 +222,10 @@ def fit_joints(
         axis, pivot, state, mean = _fit_screw(invert_se3(pose[:, parent]) @ pose[:, child], joint_type)
         frame = into_object[parent]
         into_object[child] = frame @ mean
-        axes.append(frame[:3, :3] @ axis)
+        axis = frame[:3, :3] @ axis
+        if axes and axis @ axes[0] < 0:  # all joints of an object point one way, as far as they are parallel
+            axis, state = -axis, -state
+        axes.append(axis)
         pivots.append(transform_points(frame, pivot[None])[0])
         states.append(state)
     points = template.points.clone()
@@ -254,7 +257,7 @@ def _principal_frame(points: Tensor) -> Tensor:
 
 
 def _fit_screw(relative: Tensor, joint_type: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Axis [3], pivot [3], states [n] and mean [4, 4] with relative poses [n, 4, 4] ~ screw(axis, pivot, state) @ mean."""
+    """Axis [3], pivot [3], states [n], mean [4, 4]: relative poses [n, 4, 4] ~ screw(axis, pivot, state) @ mean."""
     mean_rotation = roma.special_procrustes(relative[:, :3, :3].mean(dim=0))
     if joint_type == PRISMATIC:
         mean = se3(mean_rotation, relative[:, :3, 3].mean(dim=0))
