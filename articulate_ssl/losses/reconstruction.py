@@ -38,7 +38,9 @@ def distances_to_cloud(
     else:
         foreign = labels[:, None] != torch.arange(posed.shape[1], device=points.device)[:, None]  # [B, K, N]
         foreign = foreign & ~foreign.all(dim=-1, keepdim=True)
-        index = nearest_index(posed, target + 1e3 * foreign[..., None])
+        # Masked distances, not moved points: points moved far off cost float32 all precision of the near ones.
+        distance = torch.cdist(posed.detach(), target.detach())
+        index = distance.masked_fill_(foreign[:, :, None], torch.inf).argmin(dim=-1)
     return _gap(posed, target, index)
 
 
