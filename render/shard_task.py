@@ -19,7 +19,7 @@ from render.seeds import generator_for
 from render.sources import open_source
 
 SAMPLES_PER_SHARD = 250
-_REACH_STATES = 3
+_REACH_STATES = 8  # in which a sensor looks for reachable surface; parts must hide each other in different ways
 
 
 @dataclass(frozen=True)
@@ -231,9 +231,9 @@ def _load_instance(category: str, source: str, root: str | None, seed: int, inst
 def _reachable_surface(options: SetOptions, split: str, instance_id: str) -> ReachableSurface:
     """The instance's pool of reachable points; kept for the next shard of the same instance."""
     instance = _load_instance(options.category, options.source, options.root, options.seed, instance_id)
-    lower, upper = np.array(load_category(options.category).sampled_ranges(instance)).T
-    states = np.linspace(lower, upper, _REACH_STATES)
-    return ReachableSurface(instance, states, generator_for(options.seed, split, instance_id, "surface"))
+    rng = generator_for(options.seed, split, instance_id, "surface")
+    states = sample_states(load_category(options.category).sampled_ranges(instance), _REACH_STATES, rng)
+    return ReachableSurface(instance, states, rng)
 
 
 @lru_cache(maxsize=1)

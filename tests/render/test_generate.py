@@ -250,26 +250,16 @@ def test_output_that_cannot_be_written(tmp_path, capsys):
 def test_full_disk_keeps_what_is_done_and_can_be_continued(tmp_path, complete_set, monkeypatch, capsys):
     fsync, calls = os.fsync, []
 
-    def full_after_one(descriptor):
+    def full_after_the_journal_and_one_shard(descriptor):
         calls.append(descriptor)
-        if len(calls) > 1:
+        if len(calls) > 2:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         fsync(descriptor)
 
-    monkeypatch.setattr(atomic.os, "fsync", full_after_one)
+    monkeypatch.setattr(atomic.os, "fsync", full_after_the_journal_and_one_shard)
     folder = set_folder(tmp_path, "laptop")
-    options = [
-        "--category",
-        "laptop",
-        "--out",
-        str(tmp_path),
-        "--train-instances",
-        "2",
-        "--test-instances",
-        "1",
-        *SMALL,
-    ]
-    assert main([*options, "--workers", "1"]) == 2
+    counts = ["--train-instances", "2", "--test-instances", "1"]
+    assert main(["--category", "laptop", "--out", str(tmp_path), "--workers", "1", *counts, *SMALL]) == 2
     assert "No space left on device" in capsys.readouterr().err
     shards = {name for name in contents(folder) if name.endswith(".npz")}
     assert shards == {"train/shard-00000.npz"} and not (folder / "manifest.json").exists()
