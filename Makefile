@@ -23,7 +23,11 @@ cluster := .venv/.cluster
 
 # Only `make setup` compiles torch-scatter and torch-cluster unless told not to (CLUSTER=0); the other targets take 4
 # minutes less on a fresh machine and need neither, so they compile them only when told to (CLUSTER=1).
-demo_options := -c configs/laptop.yaml -c configs/profiles/cpu.yaml -c configs/profiles/smoke.yaml --data.root build/demo/data --trainer.default_root_dir build/demo/run
+demo_options := -c configs/laptop.yaml -c configs/profiles/cpu.yaml -c configs/profiles/smoke.yaml \
+  --data.root build/demo/data --trainer.default_root_dir build/demo/run
+# One cloud of the real laptop, half open, in the metres of its model.
+demo_shard := build/demo/data/laptop/urdf-complete/test/shard-00000.npz
+demo_scan := import numpy as np; s = np.load("$(demo_shard)"); np.save("build/demo/scan.npy", s["points"][2] * s["scale"][2] + s["center"][2])
 
 needs := $(packages) $(if $(filter 1,$(CLUSTER)),$(cluster))
 
@@ -60,17 +64,21 @@ lint: $(needs) ## Check style and formatting.
 	$(bin)/ruff check .
 	$(bin)/ruff format --check .
 
-bench: $(needs) ## Measure speed and memory: prints a table, writes build/bench.json.
+bench: $(needs) ## Measure speed and memory: prints a table, writes build/bench.json. [ARGS="--device cuda"]
 	$(bin)/python -m articulate_ssl.benchmark $(ARGS)
 
-demo: $(needs) ## Set up without compiling, make data, train, test, predict on a real laptop: 20 min from a fresh clone.
-	$(bin)/python -m render.generate --category laptop --out build/demo/data --train-instances 24 --test-instances 4 --states 20 --rotations 2
+demo: $(needs) ## Set up without compiling, make data, train briefly, test, predict on a real laptop: within 20 min of a clone.
+	rm -rf build/demo
+	$(bin)/python -m render.generate --category laptop --train-instances 24 --test-instances 4 --states 20 --rotations 2 --out build/demo/data
 	$(bin)/lightning fit $(demo_options)
 	$(bin)/lightning test $(demo_options)
-	$(bin)/python -m render.generate --category laptop --source urdf --root tests/data/real_objects/laptop --out build/demo/data --train-instances 0 --test-instances 1 --states 5 --rotations 1
-	$(bin)/python -c 'import numpy as np; np.save("build/demo/real_laptop.npy", np.load("build/demo/data/laptop/urdf-complete/test/shard-00000.npz")["points"][2])'
-	$(bin)/lightning predict build/demo/real_laptop.npy --ckpt "$$(find build/demo/run -name last.ckpt | head -n 1)" --out build/demo/prediction
-	@echo 'metrics: '; find build/demo/run -name 'metrics.*' -o -name '*.png'; echo 'picture of the real laptop: '; find build/demo/prediction -name '*.png'
+	$(bin)/python -m render.generate --category laptop --source urdf --root tests/data/real_objects/laptop --train-instances 0 --test-instances 1 --states 5 --rotations 1 --out build/demo/data
+	$(bin)/python -c '$(demo_scan)'
+	$(bin)/lightning predict build/demo/scan.npy --ckpt "$$(find build/demo/run -name last.ckpt)" --out build/demo/prediction
+	@echo 'Metrics of the laptops that training never saw, and their picture:'
+	@find "$$PWD/build/demo/run" -name metrics.json -o -name '*.png' | sed 's/^/  /'
+	@echo 'Picture of the real laptop (tests/data/real_objects/laptop):'
+	@echo "  $$PWD/build/demo/prediction/picture.png"
 
 clean: ## Remove build/, caches and the set-up; data/, runs/ and compiled wheels stay.
 	rm -rf build .venv *.egg-info .pytest_cache .ruff_cache .hypothesis
