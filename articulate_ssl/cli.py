@@ -33,6 +33,7 @@ def _learn(arguments: list[str]) -> int:
     import warnings
 
     import torch
+    from lightning.pytorch.callbacks import ModelCheckpoint
     from lightning.pytorch.cli import LightningCLI
 
     from articulate_ssl.inference.checkpoint_file import CheckpointError, read_checkpoint
@@ -43,6 +44,8 @@ def _learn(arguments: list[str]) -> int:
 
     warnings.filterwarnings("ignore", ".*isinstance.treespec, LeafSpec.*")
     warnings.filterwarnings("ignore", ".*does not have many workers.*")
+    warnings.filterwarnings("ignore", ".*`tensorboardX` has been removed.*")
+    warnings.filterwarnings("ignore", ".*The dirpath has changed.*")
     torch.set_float32_matmul_precision("high")
 
     class ArticulateCLI(LightningCLI):
@@ -54,7 +57,7 @@ def _learn(arguments: list[str]) -> int:
             options = self.config_init[subcommand]
             if options.get("ckpt_path") is None:
                 folder = Path(self.trainer.default_root_dir)
-                found = sorted(folder.glob("**/last.ckpt"), key=lambda p: p.stat().st_mtime)
+                found = sorted(folder.glob("**/checkpoints/*.ckpt"), key=lambda p: p.stat().st_mtime)
                 if not found:
                     raise CheckpointError(
                         f"lightning {subcommand}: no checkpoint under {folder}; "
@@ -81,6 +84,12 @@ def _learn(arguments: list[str]) -> int:
             ArticulatedPoseModule,
             ArticulatedDataModule,
             seed_everything_default=0,
+            trainer_defaults={
+                "callbacks": [
+                    ModelCheckpoint(filename="final-{step}"),
+                    ModelCheckpoint(filename="{step}", every_n_train_steps=200, save_last=True),
+                ]
+            },
             save_config_kwargs={"overwrite": True},
         )
     except (CheckpointError, ManifestError, ShardError) as error:

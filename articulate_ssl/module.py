@@ -34,7 +34,7 @@ from articulate_ssl.options import (
 )
 from articulate_ssl.prediction import Prediction
 from articulate_ssl.recipes.objective import PoseTarget, Terms, paper_terms, staged_terms, winning_hypothesis
-from articulate_ssl.recipes.part_discovery import ArticulatedTemplate, discover
+from articulate_ssl.recipes.part_discovery import ArticulatedTemplate, dense_template, discover
 from articulate_ssl.registration import JointModel, LabelledTemplate, register_articulated
 from datamodules.articulated_dataset import split_labels
 from datamodules.geometry import PRISMATIC, REVOLUTE, invert_se3, se3, transform_points
@@ -132,7 +132,7 @@ class ArticulatedPoseModule(LightningModule):
     def align(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Stage 0: clouds turned roughly to canonical orientation [B, N, 3], and the pose [B, 4, 4] that undoes it."""
         if self.rigid is None:
-            return points, torch.eye(4, device=points.device).expand(len(points), 4, 4)
+            return points, torch.eye(4).to(points).expand(len(points), 4, 4)
         with torch.no_grad():
             hypotheses = self.rigid(points)
             best = hypothesis_distances(points, hypotheses.posed()).argmin(dim=1)
@@ -436,15 +436,9 @@ class ArticulatedPoseModule(LightningModule):
     def _adopt(self, found: ArticulatedTemplate, dense: Tensor) -> None:
         """Make the discovered template and joints the network's category-level shapes and joints."""
         net = self.articulated
-        best = int(found.error.argmin())
-        pose = found.part_pose()[best]
-        nearest = torch.cdist(dense[best], found.template.posed(found.part_pose()[best : best + 1])[0]).argmin(dim=1)
-        label = found.template.label[nearest]
-        canonical = (
-            torch.einsum("kij,nj->kni", invert_se3(pose)[:, :3, :3], dense[best]) + invert_se3(pose)[:, None, :3, 3]
-        )
+        template = dense_template(found, dense)
         for part in range(self.num_parts):
-            points = canonical[part, label == part].cpu().numpy()
+            points = template.points[template.label == part].cpu().numpy()
             order = farthest_point_order(points, min(len(points), net.shape_points))
             shape = torch.as_tensor(np.resize(points[order], (net.shape_points, 3)))
             center = shape.mean(dim=0)

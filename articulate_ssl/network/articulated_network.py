@@ -123,7 +123,7 @@ class ArticulatedNetwork(nn.Module):
         super().__init__()
         if joint_type not in (REVOLUTE, PRISMATIC):
             raise ValueError(f"joint_type must be {REVOLUTE} or {PRISMATIC}, got {joint_type}")
-        elements = torch.as_tensor(group.elements).float()
+        elements = group.elements
         pairs = pair_index(num_parts)
         self.num_parts, self.shape_points, self.joint_type = num_parts, shape_points, joint_type
         self.state_bound, self.flow_bound, self.stretch_bound = state_bound, flow_bound, stretch_bound
@@ -178,10 +178,10 @@ class ArticulatedNetwork(nn.Module):
         features = self.backbone(points_in)
         centers = points_in[:, : features.shape[1]] - mean
 
-        logits = self.part_proposal(self.point_pool(features)).float()
+        logits = self.part_proposal(self.point_pool(features)).to(points.dtype)
         ones = centers.new_ones(*centers.shape[:2], 1)
         association = torch.cat([logits.softmax(dim=-1), ones], dim=-1)
-        pooled = self.pointnet(features, centers, association).float()
+        pooled = self.pointnet(features, centers, association).to(points.dtype)
         whole = pooled[:, -1:].expand(-1, self.num_parts, -1, -1)
         parts = pooled[:, :-1] if self.part_features else whole
         equivariant = torch.cat([parts, whole], dim=-1)
@@ -210,7 +210,9 @@ class ArticulatedNetwork(nn.Module):
 
     def _canonical_shape(self, invariant: Tensor) -> tuple[Tensor, Tensor]:
         """[B, K, M, 3] shapes and [B, K, 3] assembling translations from invariant part features [B, K, 2D]."""
-        out = torch.stack([head(invariant[:, k]) for k, head in enumerate(self.shape_head)], dim=1).float()
+        out = torch.stack([head(invariant[:, k]) for k, head in enumerate(self.shape_head)], dim=1).to(
+            self.template.dtype
+        )
         shift, stretch, flow = out.split([3, 3, 3 * self.shape_points], dim=-1)
         stretch = (self.stretch_bound * stretch.tanh()).exp()
         along = self.principal_axes * stretch[..., None, :]
@@ -221,22 +223,27 @@ class ArticulatedNetwork(nn.Module):
     def _pairs(self, invariant: Tensor) -> tuple[Tensor, Tensor]:
         """Adjacency confidences [B, E] and pivots [B, E, 3] from invariant features of part pairs."""
         both = [torch.cat([invariant[:, i], invariant[:, j]], dim=-1) for i, j in self.pairs.tolist()]
-        out = torch.stack([head(x) for head, x in zip(self.pair_head, both, strict=True)], dim=1).float()
+        out = torch.stack([head(x) for head, x in zip(self.pair_head, both, strict=True)], dim=1).to(
+            self.template.dtype
+        )
         return self.confidence + out[..., 0], self.pivot + out[..., 1:]
 
     def _axes(self, equivariant: Tensor) -> Tensor:
         """Axis hypotheses [B, G, E, 3] of the part pairs: the category's axis, tilted by the deeper part's features."""
-        tilt = torch.stack([head(equivariant[:, k]) for k, head in enumerate(self.axis_head)], dim=2).float()
+        tilt = torch.stack([head(equivariant[:, k]) for k, head in enumerate(self.axis_head)], dim=2).to(
+            self.template.dtype
+        )
         tilt = tilt[:, :, self.pairs[:, 1]]
         return functional.normalize(self.axis + tilt, dim=-1)
 
     def _states(self, equivariant: Tensor, chain: KinematicChain) -> Tensor:
         """Joint-state hypotheses [B, G, J], each from the features of the part that the joint moves."""
-        state = [self.state_head[k](equivariant[:, k]).float()[..., 0] for k in chain.child]
+        state = [self.state_head[k](equivariant[:, k]).to(self.template.dtype)[..., 0] for k in chain.child]
         return self.state_bound * torch.stack(state, dim=-1).tanh()
 
     def _base(self, equivariant: Tensor, chain: KinematicChain, mean: Tensor) -> Tensor:
         """Base transformation hypotheses [B, G, 4, 4]: group element x predicted residual, about the cloud's mean."""
-        residual = self.base_head[chain.root](equivariant[:, chain.root]).float()
-        translation = torch.einsum("gij,bgj->bgi", self.elements, residual[..., 3:]) + mean
-        return se3(self.elements @ roma.rotvec_to_rotmat(residual[..., :3]), translation)
+        residual = self.base_head[chain.root](equivariant[:, chain.root]).to(self.template.dtype)
+        elements = self.elements.to(residual)
+        translation = torch.einsum("gij,bgj->bgi", elements, residual[..., 3:]) + mean
+        return se3(elements @ roma.rotvec_to_rotmat(residual[..., :3]), translation)

@@ -43,7 +43,7 @@ class RigidAlignment(nn.Module):
     ) -> None:
         """Args: backbone with `in_dim` output channels; hidden width; points of the canonical shape; flow bound."""
         super().__init__()
-        elements = torch.as_tensor(group.elements).float()
+        elements = group.elements
         self.register_buffer("elements", elements, persistent=False)
         self.backbone = backbone
         self.pointnet = SO3PointNet(in_dim, dim, elements)
@@ -61,9 +61,12 @@ class RigidAlignment(nn.Module):
         features = self.backbone(points)
         centers = points[:, : features.shape[1]]
         mean = points.mean(dim=1, keepdim=True)
-        whole = self.pointnet(features, centers - mean, centers.new_ones(*centers.shape[:2], 1)).squeeze(1).float()
-        residual = self.pose_head(whole).float()
-        flow = self.flow_head(self.pool(whole)).float().view(len(points), -1, 3)
-        rotation = self.elements @ roma.rotvec_to_rotmat(residual[..., :3])
-        translation = torch.einsum("gij,bgj->bgi", self.elements, residual[..., 3:]) + mean
+        whole = (
+            self.pointnet(features, centers - mean, centers.new_ones(*centers.shape[:2], 1)).squeeze(1).to(points.dtype)
+        )
+        residual = self.pose_head(whole).to(points.dtype)
+        flow = self.flow_head(self.pool(whole)).to(points.dtype).view(len(points), -1, 3)
+        elements = self.elements.to(residual)
+        rotation = elements @ roma.rotvec_to_rotmat(residual[..., :3])
+        translation = torch.einsum("gij,bgj->bgi", elements, residual[..., 3:]) + mean
         return RigidHypotheses(rotation, translation, self.template + self.flow_bound * flow.tanh())

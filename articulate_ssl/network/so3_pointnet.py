@@ -16,7 +16,7 @@ class SO3PointNet(nn.Module):
     def __init__(self, in_dim: int, out_dim: int, elements: Tensor) -> None:
         """Args: input and output channels; `elements` [G, 3, 3], the group's rotation matrices."""
         super().__init__()
-        self.register_buffer("elements", elements.float(), persistent=False)
+        self.register_buffer("elements", elements, persistent=False)
         self.perceptron = nn.Sequential(
             nn.Linear(in_dim + 3, out_dim),
             nn.LayerNorm(out_dim),

@@ -133,6 +133,35 @@ def _search(found: ArticulatedTemplate, clouds: Tensor, rotations: Tensor) -> tu
     return search_articulated(found.template, found.joints, clouds, rotations, states)
 
 
+def dense_template(
+    found: ArticulatedTemplate,
+    clouds: Tensor,  # [n, P, 3] the clouds that `found` is registered to, more densely
+    points: int = 1024,
+    keep: float = 0.75,
+) -> LabelledTemplate:
+    """A denser template: the best fitted cloud near the canonical state, every point labelled by all clouds' evidence.
+
+    Parts that lie against each other (a closed laptop) cannot be told apart in one cloud, hence a cloud near the mean
+    state, and hence the labels from which part's motion explains a point in the other clouds.
+    """
+    clouds = clouds[:, :points]
+    distance = (found.state / found.state.std(dim=0)).abs().amax(dim=1)
+    central = distance <= distance.quantile(0.3)
+    reference = int(found.error.masked_fill(~central, torch.inf).argmin())
+    pose = found.part_pose()
+    inverse = invert_se3(pose[reference])
+    cloud = clouds[reference]
+    nearest = torch.cdist(cloud, found.template.posed(pose[reference, None])[0]).argmin(dim=1)
+    label = found.template.label[nearest]
+    kept = found.error.argsort()[: int(keep * len(clouds))]
+    rows = torch.arange(len(cloud), device=cloud.device)
+    for _ in range(2):
+        canonical = transform_points(inverse, cloud)[label, rows]
+        template = LabelledTemplate(canonical, label, found.template.num_parts)
+        label = relabel(template, pose[kept], clouds[kept], cap=0.04).label
+    return LabelledTemplate(transform_points(inverse, cloud)[label, rows], label, found.template.num_parts)
+
+
 def choose_reference(clouds: Tensor) -> int:
     """Index of the most typical cloud: the medoid of the sorted distances to the centre (invariant to rotation)."""
     radius = (clouds - clouds.mean(dim=1, keepdim=True)).norm(dim=-1).sort(dim=1).values
