@@ -291,7 +291,7 @@ class ArticulatedPoseModule(LightningModule):
         s = self.schedule
         if self.recipe == "paper":
             return s.decay ** (step // s.decay_every)
-        return s.decay + (1 - s.decay) * 0.5 * (1 + math.cos(math.pi * min(step / s.steps, 1)))
+        return s.final_rate + (1 - s.final_rate) * 0.5 * (1 + math.cos(math.pi * min(step / s.steps, 1)))
 
     def category_rate(self, step: int) -> float:
         """The same for category-level shapes and joints: held during the staged recipe's warm-up."""

@@ -76,9 +76,9 @@ class ScheduleOptions:
         rigid_steps: Steps of stage 0, rigid alignment of the whole shape, before the articulated network trains.
         warmup_steps: Steps on registered clouds alone, with the category's shapes and joints held (staged recipe).
         learning_rate: Of Adam.
-        decay: The learning rate is multiplied by this every `decay_every` steps (paper recipe), or reaches this
-            share of itself along a cosine (staged recipe).
+        decay: The learning rate is multiplied by this every `decay_every` steps (paper recipe).
         decay_every: See above.
+        final_rate: Share of the learning rate that is left at the end of its cosine (staged recipe).
         category_rate: Learning rate of category-level shapes and joints relative to the networks' (staged recipe).
     """
 
@@ -88,6 +88,7 @@ class ScheduleOptions:
     learning_rate: float = 1e-4
     decay: float = 0.7
     decay_every: int = 1000
+    final_rate: float = 0.02
     category_rate: float = 0.1
 
 

@@ -52,6 +52,8 @@ class ArticulatedDataModule(LightningDataModule):
         max_test_samples: Test on at most this many samples, spread evenly over instances, states and rotations; the
             same ones every time.
         dense_in_fit: Deliver the dense arrays in training and validation too.
+        calibration_set: Folder of the set whose training clouds calibrate metrics, if not this set's own: what the
+            network was trained on, when it is tested on objects or views from elsewhere.
         verify: Compare every shard with its checksum when a stage begins.
 
     Raises:
@@ -75,6 +77,7 @@ class ArticulatedDataModule(LightningDataModule):
         val_samples: int = 64,
         max_test_samples: int | None = None,
         dense_in_fit: bool = False,
+        calibration_set: str | None = None,
         verify: bool = True,
     ) -> None:
         super().__init__()
@@ -164,8 +167,16 @@ class ArticulatedDataModule(LightningDataModule):
         Args:
             samples: Size of the subset, spread evenly over instances and states.
         """
-        options, rotate = self.hparams, self.manifest.view == "complete"
-        dataset = ArticulatedDataset(self.folder, "train", options.num_points, rotate, verify=options.verify)
+        options = self.hparams
+        folder = self.folder if options.calibration_set is None else Path(options.calibration_set)
+        manifest = self.manifest if options.calibration_set is None else Manifest.load(folder)
+        if not manifest.num_samples("train"):
+            raise ManifestError(
+                f"{folder}: has no training clouds to calibrate metrics on; name the set that the network was trained "
+                "on with --data.calibration_set"
+            )
+        rotate = manifest.view == "complete"
+        dataset = ArticulatedDataset(folder, "train", options.num_points, rotate, verify=options.verify)
         return self._loader(dataset, EvaluationSampler(spread_subset(dataset.labels["instance"], samples)))
 
     def on_before_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
