@@ -28,7 +28,7 @@ from render.depth_renderer import DepthRenderer, RendererUnavailable
 from render.execution import run_tasks
 from render.partial_cloud import RENDERERS
 from render.shard_task import SetOptions, ShardResult, ShardTask, plan_shards
-from render.sources import SOURCES, open_source
+from render.sources import SOURCES, Source, open_source
 
 JOURNAL_NAME = ".journal.jsonl"
 
@@ -42,6 +42,7 @@ def generate(options: SetOptions, out: Path, workers: int, scheduler: str | None
     """
     folder = set_folder(out, options.category, options.source, options.view, options.protocol)
     ids = split_instances(options)
+    _report_left_out(options)
     for split in SPLITS:
         (folder / split).mkdir(parents=True, exist_ok=True)
     with _alone_in(folder):
@@ -95,7 +96,7 @@ def split_instances(options: SetOptions) -> dict[str, tuple[str, ...]]:
     Raises:
         ValueError: if the source has too few instances.
     """
-    ids = _instance_ids(options.category, options.source, options.root, options.seed)
+    ids = _open(options.category, options.source, options.root, options.seed).instance_ids()
     train, test = options.train_instances, options.test_instances
     if train + test > len(ids):
         raise ValueError(
@@ -105,8 +106,17 @@ def split_instances(options: SetOptions) -> dict[str, tuple[str, ...]]:
     return {"train": tuple(ids[:train]), "test": tuple(ids[train : train + test])}
 
 
-def _instance_ids(category: str, source: str, root: str | None, seed: int) -> list[str]:
-    return open_source(source, load_category(category), None if root is None else Path(root), seed).instance_ids()
+def _open(category: str, source: str, root: str | None, seed: int) -> Source:
+    return open_source(source, load_category(category), None if root is None else Path(root), seed)
+
+
+def _report_left_out(options: SetOptions) -> None:
+    """Say on stderr which objects the source left out, one line for every reason."""
+    ids: dict[str, list[str]] = {}
+    for instance_id, reason in _open(options.category, options.source, options.root, options.seed).left_out().items():
+        ids.setdefault(reason, []).append(instance_id)
+    for reason in ids:
+        print(f"left out {len(ids[reason])} object(s), {reason}: {', '.join(ids[reason])}", file=sys.stderr)
 
 
 def default_split(spec: CategorySpec, available: int) -> tuple[int, int]:
@@ -289,7 +299,7 @@ def options_from(arguments: argparse.Namespace) -> SetOptions:
         raise ValueError(f"source {arguments.source!r} {need} --root")
     if not 0 <= arguments.noise_std < 1:
         raise ValueError(f"--noise-std must be in [0, 1), not {arguments.noise_std}")
-    ids = _instance_ids(spec.name, arguments.source, arguments.root, arguments.seed)
+    ids = _open(spec.name, arguments.source, arguments.root, arguments.seed).instance_ids()
     train, test = default_split(spec, len(ids))
     train = train if arguments.train_instances is None else arguments.train_instances
     test = test if arguments.test_instances is None else arguments.test_instances

@@ -25,6 +25,10 @@ class Source(Protocol):
     def instance_ids(self) -> list[str]:
         """Ids of all instances, in a fixed order."""
 
+    def left_out(self) -> dict[str, str]:
+        """Why, by id, objects of the category's kind are no instances of it: a safe with two doors, for example."""
+        return {}
+
     def load(self, instance_id: str) -> ArticulatedObject:
         """The instance; the same object for every call.
 

@@ -7,6 +7,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+_DEPTH = 5  # of folders that are searched; symbolic links may lead round in circles
+
 
 def find_instances(
     root: Path | None,
@@ -36,19 +38,21 @@ def find_instances(
         return {root.resolve().name: root}
     named = [root / prefix / name for prefix in prefixes for name in category_folders]
     base = next((folder for folder in named if folder.is_dir()), root)
-    found = {path.relative_to(base).as_posix(): path for path in _folders_with(marker, base)}
+    found = {path.relative_to(base).as_posix(): path for path in _folders_with(marker, base, depth=_DEPTH)}
     if not found:
         raise ValueError(f"{base}: no instance found, no folder in it holds a {marker}")
     return found
 
 
-def _folders_with(marker: str, folder: Path) -> Iterator[Path]:
+def _folders_with(marker: str, folder: Path, depth: int) -> Iterator[Path]:
     """Folders below `folder` that hold the marker, sorted; instances are not searched for further instances."""
+    if depth == 0:
+        return
     for below in sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")):
         if (below / marker).is_file():
             yield below
         else:
-            yield from _folders_with(marker, below)
+            yield from _folders_with(marker, below, depth - 1)
 
 
 def read_json(file: Path) -> Any:

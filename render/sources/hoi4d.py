@@ -17,6 +17,7 @@ import numpy as np
 
 from datamodules.geometry import PRISMATIC, REVOLUTE
 from render.articulated_object import ArticulatedObject
+from render.sources import Source
 from render.sources.dataset_folder import find_instances, read_json
 from render.sources.link_graph import FIXED, Link, LinkGraph, LinkJoint
 from render.sources.mesh_loading import concatenate, load_mesh, resolve_inside
@@ -39,15 +40,20 @@ _PREFIXES = (".", "articulated", "HOI4D_CAD_Model_for_release/articulated")
 
 
 @dataclass(frozen=True)
-class Hoi4dSource:
+class Hoi4dSource(Source):
     """CAD models of one category; ids are the folder names."""
 
     spec: CategorySpec
     folders: dict[str, Path]
+    excluded: tuple[str, ...]
 
     def instance_ids(self) -> list[str]:
         """Ids of all instances, sorted."""
         return list(self.folders)
+
+    def left_out(self) -> dict[str, str]:
+        """The folders that the category excludes by name."""
+        return dict.fromkeys(self.excluded, f"the category {self.spec.name!r} excludes the model by its name")
 
     def load(self, instance_id: str) -> ArticulatedObject:
         """The instance, stored as modelled.
@@ -63,12 +69,18 @@ def open(spec: CategorySpec, root: Path | None, seed: int) -> Hoi4dSource:
     """Source of the CAD models below `root`, without the instances that the category excludes; `seed` is not used.
 
     Raises:
-        ValueError: if the category is not in the data set or `root` holds no instance.
+        ValueError: if the category is not in the data set or `root` holds no instance that it does not exclude.
     """
     require_rules(spec, SOURCE)
     rules = spec.recognition.rules(SOURCE) if spec.parts else {}
     found = find_instances(root, "mobility_v2.json", rules.get("folders", ()), _PREFIXES)
-    return Hoi4dSource(spec, {i: folder for i, folder in found.items() if i not in rules.get("exclude", ())})
+    excluded = tuple(i for i in found if i in rules.get("exclude", ()))
+    if len(excluded) == len(found):
+        raise ValueError(
+            f"{root}: no instance is left, category {spec.name!r} excludes {', '.join(excluded)}; name another folder, "
+            f"or take it as category 'articulated'"
+        )
+    return Hoi4dSource(spec, {i: folder for i, folder in found.items() if i not in excluded}, excluded)
 
 
 def read_mobility_v2(folder: Path) -> LinkGraph:

@@ -56,6 +56,12 @@ class LinkJoint:
         """Whether the limits end the motion: a revolute joint that may turn all the way round has none in effect."""
         return self.upper - self.lower < (inf if self.type == PRISMATIC else 2 * pi - 0.01)
 
+    @property
+    def direction(self) -> np.ndarray:  # [3]
+        """The axis with length 1."""
+        scaled = self.axis / np.abs(self.axis).max()  # squares of very large or small components leave float64
+        return scaled / np.linalg.norm(scaled)
+
 
 @dataclass(frozen=True)
 class LinkGraph:
@@ -74,12 +80,14 @@ class LinkGraph:
             where = f"{self.file}: joint {joint.name!r}"
             if not np.isfinite([*joint.axis, *joint.pivot]).all():
                 raise ValueError(f"{where} has a NaN or infinite axis or origin")
-            if np.linalg.norm(joint.axis) < 1e-9:
+            if np.abs(joint.axis).max() < 1e-9:
                 raise ValueError(f"{where} has a zero axis; it needs a direction")
             if np.isnan([joint.lower, joint.upper]).any():
                 raise ValueError(f"{where} has a NaN limit")
             if joint.lower > joint.upper:
                 raise ValueError(f"{where} has reversed limits [{joint.lower:g}, {joint.upper:g}]; exchange them")
+            if joint.lower == inf or joint.upper == -inf:
+                raise ValueError(f"{where} has limits [{joint.lower:g}, {joint.upper:g}]; state a range to move over")
 
     def movable(self) -> list[LinkJoint]:
         """All joints but the fixed ones, in stored order."""
@@ -203,7 +211,7 @@ def _merged_joint(joint: LinkJoint, part_of: dict[str, int], file: Path) -> Join
     lower, upper = joint.lower, joint.upper
     if not joint.is_limited and joint.type == REVOLUTE:
         lower, upper = -pi, pi
-    if not lower < upper < inf or lower == -inf:
+    if not 0 < upper - lower < inf:
         raise ValueError(f"{file}: joint {joint.name!r} has limits [{lower:g}, {upper:g}]; state a range to move over")
-    axis = joint.axis / np.linalg.norm(joint.axis)
-    return Joint(joint.name, joint.type, part_of[joint.parent], part_of[joint.child], axis, joint.pivot, lower, upper)
+    parent, child = part_of[joint.parent], part_of[joint.child]
+    return Joint(joint.name, joint.type, parent, child, joint.direction, joint.pivot, lower, upper)

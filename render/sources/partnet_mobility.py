@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from datamodules.geometry import PRISMATIC, REVOLUTE
 from render.articulated_object import ArticulatedObject
+from render.sources import Source
 from render.sources.dataset_folder import find_instances, read_json
 from render.sources.part_matching import joint_groups, require_rules, to_category
 from render.sources.urdf import read_urdf
@@ -27,7 +29,7 @@ _MOVABLE = MappingProxyType({"hinge": REVOLUTE, "slider": PRISMATIC, "slider+": 
 
 
 @dataclass(frozen=True)
-class PartNetMobilitySource:
+class PartNetMobilitySource(Source):
     """Objects of the category's `model_cat` that have exactly its parts; ids are the folder names (anno ids)."""
 
     spec: CategorySpec
@@ -36,13 +38,13 @@ class PartNetMobilitySource:
     def instance_ids(self) -> list[str]:
         """Ids of all instances, sorted.
 
-        Objects of another `model_cat` and objects with another number of the category's parts (a safe with two doors)
-        are other things than the category and are left out.
+        Objects of another `model_cat` belong to other categories. Of the category's, those with another number of its
+        parts (a safe with two doors) are other things and are left out.
 
         Raises:
             ValueError: if no object is left.
         """
-        ids = [instance_id for instance_id, folder in self.folders.items() if self._is_instance(folder)]
+        ids, _ = self._selection
         if not ids:
             groups = joint_groups(self.spec, SOURCE)
             wanted = " and ".join(f"{len(joints)} part(s) labelled {label!r}" for (_, label), joints in groups.items())
@@ -51,7 +53,11 @@ class PartNetMobilitySource:
                 f"{next(iter(self.folders.values())).parent}: no matching parts, none of {len(self.folders)} objects "
                 f"is of model_cat {categories} with {wanted}"
             )
-        return ids
+        return list(ids)
+
+    def left_out(self) -> dict[str, str]:
+        """By id, how many of the category's parts the other objects of its `model_cat` have."""
+        return dict(self._selection[1])
 
     def load(self, instance_id: str) -> ArticulatedObject:
         """The instance, stored at the URDF's zero configuration, which may lie outside the limits.
@@ -64,18 +70,31 @@ class PartNetMobilitySource:
         graph = read_urdf(folder / "mobility.urdf", folder, below_root=True).labelled(labels)
         return to_category(graph, self.spec, SOURCE, instance_id, front_known=True)
 
-    def _is_instance(self, folder: Path) -> bool:
+    @cached_property
+    def _selection(self) -> tuple[list[str], dict[str, str]]:
+        """Ids of the instances, and why the other objects of the category's `model_cat` are none."""
         if not self.spec.parts:
+            return list(self.folders), {}
+        of_category = {i: folder for i, folder in self.folders.items() if self._is_of_category(folder)}
+        mismatches = {i: self._mismatch(folder) for i, folder in of_category.items()}
+        return [i for i, reason in mismatches.items() if not reason], {i: r for i, r in mismatches.items() if r}
+
+    def _is_of_category(self, folder: Path) -> bool:
+        meta = folder / "meta.json"
+        if not meta.exists():  # some copies of the data set come without: the parts alone decide
             return True
-        meta = folder / "meta.json"  # some copies of the data set come without
-        if meta.exists() and read_json(meta).get("model_cat") not in self.spec.recognition.rules(SOURCE)["model_cat"]:
-            return False
+        return read_json(meta).get("model_cat") in self.spec.recognition.rules(SOURCE)["model_cat"]
+
+    def _mismatch(self, folder: Path) -> str:
+        """How the parts differ from the category's; empty if they do not."""
         links = read_semantics(folder / "semantics.txt")
-        return all(
-            sum(_MOVABLE.get(kind) == joint_type and bool(re.search(pattern, label)) for _, kind, label in links)
-            == len(joints)
-            for (joint_type, pattern), joints in joint_groups(self.spec, SOURCE).items()
-        )
+        for (joint_type, pattern), joints in joint_groups(self.spec, SOURCE).items():
+            found = sum(
+                _MOVABLE.get(kind) == joint_type and bool(re.search(pattern, label)) for _, kind, label in links
+            )
+            if found != len(joints):
+                return f"{found} movable part(s) labelled {pattern!r} instead of {len(joints)}"
+        return ""
 
 
 def open(spec: CategorySpec, root: Path | None, seed: int) -> PartNetMobilitySource:

@@ -19,6 +19,7 @@ import trimesh
 
 from datamodules.geometry import PRISMATIC, REVOLUTE
 from render.articulated_object import ArticulatedObject
+from render.sources import Source
 from render.sources.dataset_folder import find_instances, read_json
 from render.sources.face_map import load_face_map
 from render.sources.link_graph import FIXED, Link, LinkGraph, LinkJoint
@@ -34,7 +35,7 @@ JOINT_TYPES = MappingProxyType({"none": FIXED, "spiral": FIXED, "rotation": REVO
 
 
 @dataclass(frozen=True)
-class Shape2MotionSource:
+class Shape2MotionSource(Source):
     """Shapes of one category, in either layout; ids are the folder names."""
 
     spec: CategorySpec

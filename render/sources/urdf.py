@@ -2,6 +2,8 @@
 
 Frames: URDF has z up and states no front (REP 103), so z is turned to the y of the canonical object frame and the front
 is found from the motion of the parts (`render.sources.part_matching`).
+A file with another axis up at its root gives an object that lies on its side, from which partial views then look at it;
+a fixed joint above its root link sets it upright.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ import yourdfpy
 
 from datamodules.geometry import PRISMATIC, REVOLUTE
 from render.articulated_object import ArticulatedObject
+from render.sources import Source
 from render.sources.link_graph import FIXED, Link, LinkGraph, LinkJoint, tree_order
 from render.sources.mesh_loading import concatenate, load_mesh, parse_xml, resolve_inside, transformed
 from render.sources.part_matching import require_rules, to_category
@@ -43,7 +46,7 @@ _SHAPES = {"mesh": ["filename"], "box": ["size"], "cylinder": ["radius", "length
 
 
 @dataclass(frozen=True)
-class UrdfSource:
+class UrdfSource(Source):
     """Instances are URDF files; their ids are the paths below the root folder, without suffix."""
 
     spec: CategorySpec
@@ -161,7 +164,9 @@ def _check_numbers(xml: ElementTree.Element, file: Path) -> None:
             try:
                 values = [float(value) for value in text.split()]
             except ValueError as error:
-                raise ValueError(f"{file}: <{element.tag} {attribute}={text!r}> is malformed ({error})") from error
+                raise ValueError(
+                    f"{file}: <{element.tag} {attribute}={text!r}> is malformed ({error}); separate numbers by blanks"
+                ) from error
             if np.isnan(values).any() or (element.tag != "limit" and np.isinf(values).any()):
                 raise ValueError(f"{file}: <{element.tag} {attribute}={text!r}> is NaN or infinite")
             if len(values) not in counts:

@@ -11,6 +11,7 @@ from pathlib import Path
 from render.articulated_object import ArticulatedObject
 from render.category import CategorySpec
 from render.seeds import generator_for
+from render.sources import Source
 from render.sources.procedural import drawer, eyeglasses, laptop, oven, safe, washing_machine
 from render.sources.procedural.shapes import to_trimesh
 
@@ -28,7 +29,7 @@ NUM_INSTANCES = 10_000  # that have an id; they are made when they are loaded
 
 
 @dataclass(frozen=True)
-class ProceduralSource:
+class ProceduralSource(Source):
     """Instances of one category, made on demand."""
 
     spec: CategorySpec

@@ -116,7 +116,12 @@ def test_laptop_closed_at_its_upper_limit(tmp_path, category):
 def test_instances_are_sorted_without_hidden_and_excluded_ones(tmp_path):
     for name in ("003", "001", "034", ".git"):
         hoi4d_safe(tmp_path / "Safe" / name)
-    assert open_source("hoi4d", load_category("safe"), tmp_path, 0).instance_ids() == ["001", "003"]
+    source = open_source("hoi4d", load_category("safe"), tmp_path, 0)
+    assert source.instance_ids() == ["001", "003"]
+    assert source.left_out() == {"034": "the category 'safe' excludes the model by its name"}
+    with pytest.raises(ValueError, match=r"Safe/034: no instance is left, category 'safe' excludes 034; name another"):
+        open_source("hoi4d", load_category("safe"), tmp_path / "Safe/034", 0)
+    assert open_source("hoi4d", load_category("articulated"), tmp_path / "Safe/034", 0).instance_ids() == ["034"]
     with pytest.raises(ValueError, match="no objects of category 'oven'"):
         open_source("hoi4d", load_category("oven"), tmp_path, 0)
 

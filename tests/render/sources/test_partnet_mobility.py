@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from dataset_writers import CABINET, DOOR, HINGE, KNOB, LAPTOP_BASE, LID, LID_HINGE, box, partnet_safe, write_partnet
 
+from render import generate
 from render.category import load_category
 from render.sources import open_source
 from render.sources.partnet_mobility import read_semantics
@@ -140,12 +141,27 @@ def test_only_objects_with_exactly_the_categorys_parts_are_instances(tmp_path):
     semantics = (two_doors / "semantics.txt").read_text()
     (two_doors / "semantics.txt").write_text(semantics.replace("hinge knob", "hinge door"))
     write_partnet(tmp_path / "60", "Laptop", laptop_links((-1.0, 1.0), (1, 0, 0)))
-    assert open_source("partnet-mobility", load_category("safe"), tmp_path, 0).instance_ids() == ["30", "4"]
+    source = open_source("partnet-mobility", load_category("safe"), tmp_path, 0)
+    assert source.instance_ids() == ["30", "4"]
+    assert source.left_out() == {"50": "2 movable part(s) labelled '^door$' instead of 1"}
     assert open_source("partnet-mobility", load_category("articulated"), tmp_path, 0).instance_ids() == [
         "30", "4", "50", "60",
     ]  # fmt: skip
     with pytest.raises(ValueError, match=r"no matching parts, none of 4 objects is of model_cat Oven .*\^door\$"):
         open_source("partnet-mobility", load_category("oven"), tmp_path, 0).instance_ids()
+
+
+def test_the_generator_says_once_what_is_left_out_and_why(tmp_path, capsys):
+    for name in ("30", "40", "50"):
+        partnet_safe(tmp_path / "objects" / name)
+    for name in ("40", "50"):
+        file = tmp_path / "objects" / name / "semantics.txt"
+        file.write_text(file.read_text().replace("hinge knob", "hinge door"))
+    options = ["--category", "safe", "--source", "partnet-mobility", "--root", str(tmp_path / "objects")]
+    size = ["--states", "1", "--rotations", "1", "--points", "32", "--workers", "1"]
+    assert generate.main([*options, "--out", str(tmp_path / "out"), *size]) == 0
+    line = "left out 2 object(s), 2 movable part(s) labelled '^door$' instead of 1: 40, 50\n"
+    assert capsys.readouterr().err.count(line) == 1
 
 
 def test_one_object_folder_is_a_root_too_and_meta_may_be_missing(tmp_path):
