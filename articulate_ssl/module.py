@@ -359,12 +359,13 @@ class ArticulatedPoseModule(LightningModule):
         base = invert_se3(pose) @ turn @ base
         losses, estimate, labels = [], None, None
         target = PoseTarget(base, state)
+        category = self.articulated.object_template()
         for _ in range(self.network_options.iterations):
             hypotheses = self.articulated(aligned, estimate, labels)
             start = torch.eye(3, device=device) if estimate is None else estimate.base[:, 0, :3, :3]
             nearest = self.group.nearest(start.transpose(-1, -2) @ base[:, :3, :3])
             selected = hypotheses.select(nearest)
-            terms = staged_terms(selected, aligned, self.objective, target)
+            terms = staged_terms(selected, aligned, category, self.objective, target, follow_category=True)
             losses.append(terms.loss)
             if self.network_options.pose_aware:
                 winner, _ = winning_hypothesis(hypotheses, aligned, self.objective.unidirectional)
@@ -376,6 +377,7 @@ class ArticulatedPoseModule(LightningModule):
     def _staged_step(self, points: Tensor) -> Tensor:
         """Any training cloud: the best reconstruction trains, drawn to where a few rounds of registration move it."""
         aligned, _ = self.align(points)
+        category = self.articulated.object_template()
         losses = []
         for hypotheses in self.iterate(aligned):
             winner, before = winning_hypothesis(hypotheses, aligned, self.objective.unidirectional)
@@ -389,7 +391,7 @@ class ArticulatedPoseModule(LightningModule):
                     torch.where(better[:, None, None], base, start[0].detach()),
                     torch.where(better[:, None], state, start[1].detach()),
                 )
-            terms = staged_terms(selected, aligned, self.objective, target)
+            terms = staged_terms(selected, aligned, category, self.objective, target, follow_category=False)
             losses.append(terms.loss)
         self._track(terms, selected)
         return torch.stack(losses).mean()
@@ -410,6 +412,7 @@ class ArticulatedPoseModule(LightningModule):
                 "rec": terms.reconstruction,
                 "reg": terms.joints,
                 "distill": terms.distillation,
+                "deviation": terms.deviation,
                 "seg": terms.segmentation,
                 "state_spread": spread.rad2deg() if net.joint_type == REVOLUTE else spread,
                 "smallest_part": occupancy.min(),

@@ -157,6 +157,10 @@ class ArticulatedNetwork(nn.Module):
         self.register_buffer("principal_axes", torch.eye(3).repeat(num_parts, 1, 1))
         self.register_buffer("mean_confidence", torch.zeros(len(pairs)))
 
+    def object_template(self) -> Tensor:
+        """The category's canonical object, [K, M, 3]."""
+        return self.template + self.assembly[:, None]
+
     def chain(self) -> KinematicChain:
         """The category's kinematic chain, from the running mean of the predicted adjacency confidences."""
         return extract_chain(self.mean_confidence, self.num_parts)

@@ -28,6 +28,7 @@ class Terms(NamedTuple):
     reconstruction: Tensor
     joints: Tensor
     distillation: Tensor
+    deviation: Tensor
     segmentation: Tensor
     association: Tensor
 
@@ -71,24 +72,41 @@ def paper_terms(winner: Hypotheses, points: Tensor, options: ObjectiveOptions) -
     joints = _joint_term(winner, options)
     loss = reconstruction + options.joint_regularization * joints
     zero = loss.new_zeros(())
-    return Terms(loss, reconstruction, joints, zero, zero, association)
+    return Terms(loss, reconstruction, joints, zero, zero, zero, association)
 
 
-def staged_terms(selected: Hypotheses, points: Tensor, options: ObjectiveOptions, target: PoseTarget | None) -> Terms:
+def staged_terms(
+    selected: Hypotheses,
+    points: Tensor,  # [B, N, 3]
+    category: Tensor,  # [K, M, 3] the category's canonical object
+    options: ObjectiveOptions,
+    target: PoseTarget | None,
+    follow_category: bool,
+) -> Terms:
     """Part-by-part reconstruction under the posterior association, L_reg, and two teachers that registration gives.
 
     The posterior (which posed part explains a point) weights the reconstruction and teaches the part proposal; poses
     are drawn to registered ones, measured on the points they move. Segmentation weighting its own reconstruction
     collapses: one slot takes every point within a few hundred steps.
+
+    Args:
+        follow_category: Associate points with the category's parts rather than the instance's, whose predicted shapes
+            mean nothing before the network has learnt something.
     """
     posed = selected.posed()[:, 0]
     to_part = distances_to_parts(points, posed)
     distillation = points.new_zeros(())
     explained = to_part
     if target is not None:
-        goal = _posed_by(selected, target)
+        at_target = selected.at(target.base[:, None], target.state[:, None])
+        with torch.no_grad():
+            goal = at_target.posed()[:, 0]
+            shape = goal
+            if follow_category:
+                pose = at_target.object_pose()[:, 0]
+                shape = torch.einsum("bkij,kmj->bkmi", pose[..., :3, :3], category) + pose[..., None, :3, 3]
+            explained = distances_to_parts(points, shape)
         distillation = (posed - goal).norm(dim=-1).mean()
-        explained = distances_to_parts(points, goal)
     association = posterior_association(explained, options.posterior_scale)
     labels = association.argmax(dim=-1)
     to_cloud = None if options.unidirectional else distances_to_cloud(posed, points, labels)
@@ -97,20 +115,16 @@ def staged_terms(selected: Hypotheses, points: Tensor, options: ObjectiveOptions
     segmentation = functional.cross_entropy(
         selected.association_logits.flatten(0, 1), association[:, :centers].flatten(0, 1)
     )
+    deviation = (selected.object_shape() - category).square().sum(dim=-1).mean()
     joints = _joint_term(selected, options)
     loss = (
         reconstruction
         + options.joint_regularization * joints
         + options.distillation * distillation
+        + options.deviation * deviation
         + options.segmentation * segmentation
     )
-    return Terms(loss, reconstruction, joints, distillation, segmentation, association)
-
-
-@torch.no_grad()
-def _posed_by(hypothesis: Hypotheses, target: PoseTarget) -> Tensor:
-    """Where registered poses put the hypothesis's own canonical object, [B, K, M, 3]."""
-    return hypothesis.at(target.base[:, None], target.state[:, None]).posed()[:, 0]
+    return Terms(loss, reconstruction, joints, distillation, deviation, segmentation, association)
 
 
 def _joint_term(winner: Hypotheses, options: ObjectiveOptions) -> Tensor:
