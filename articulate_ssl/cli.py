@@ -6,6 +6,7 @@ Both console scripts, `lightning` and `articulate-ssl`, are this program.
 from __future__ import annotations
 
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 
@@ -38,9 +39,8 @@ def _learn(arguments: list[str]) -> int:
 
     from articulate_ssl.inference.checkpoint_file import CheckpointError, read_checkpoint
     from articulate_ssl.module import ArticulatedPoseModule
+    from articulate_ssl.recipes.part_discovery import DiscoveryError
     from datamodules.articulated_data_module import ArticulatedDataModule
-    from datamodules.manifest import ManifestError
-    from datamodules.shards import ShardError
 
     warnings.filterwarnings("ignore", ".*isinstance.treespec, LeafSpec.*")
     warnings.filterwarnings("ignore", ".*does not have many workers.*")
@@ -51,6 +51,9 @@ def _learn(arguments: list[str]) -> int:
     class ArticulateCLI(LightningCLI):
         def add_arguments_to_parser(self, parser) -> None:
             parser.link_arguments("data.category", "model.category")
+
+        def _parse_ckpt_path(self) -> None:
+            """Configurations decide, not what a checkpoint remembers; `_use_checkpoint` compares the two."""
 
         def _use_checkpoint(self, subcommand: str) -> None:
             """Only trained weights of this category are scored: a bare `lightning test` would score random ones."""
@@ -65,7 +68,13 @@ def _learn(arguments: list[str]) -> int:
                     )
                 options["ckpt_path"] = str(found[-1])
             path = options["ckpt_path"]
-            trained_on = read_checkpoint(path)["hyper_parameters"].get("category")
+            remembered = read_checkpoint(path)["hyper_parameters"]
+            if remembered.get("network") != self.model.hparams["network"]:
+                raise CheckpointError(
+                    f"{path}: trained with other network sizes; give `lightning {subcommand}` the same -c files and "
+                    "--model.network options as `lightning fit`"
+                )
+            trained_on = remembered.get("category")
             if trained_on != self.model.category:
                 raise CheckpointError(
                     f"{path}: trained on category {trained_on!r}, but the data are {self.model.category!r}; "
@@ -80,6 +89,9 @@ def _learn(arguments: list[str]) -> int:
 
     sys.argv = [sys.argv[0], *arguments]
     try:
+        for flag, value in pairwise(arguments):
+            if flag == "--ckpt_path":
+                read_checkpoint(value)
         ArticulateCLI(
             ArticulatedPoseModule,
             ArticulatedDataModule,
@@ -92,7 +104,7 @@ def _learn(arguments: list[str]) -> int:
             },
             save_config_kwargs={"overwrite": True},
         )
-    except (CheckpointError, ManifestError, ShardError) as error:
+    except (ValueError, DiscoveryError) as error:
         print(f"lightning: {error}", file=sys.stderr)
         return 2
     return 0

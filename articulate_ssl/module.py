@@ -135,10 +135,16 @@ class ArticulatedPoseModule(LightningModule):
             return points, torch.eye(4).to(points).expand(len(points), 4, 4)
         with torch.no_grad():
             hypotheses = self.rigid(points)
-            best = hypothesis_distances(points, hypotheses.posed()).argmin(dim=1)
+            distance = hypothesis_distances(points, hypotheses.posed(), bidirectional=not self.objective.unidirectional)
+            best = distance.argmin(dim=1)
             rows = torch.arange(len(points), device=points.device)
             pose = se3(hypotheses.rotation[rows, best], hypotheses.translation[rows, best])
         return transform_points(invert_se3(pose), points), pose
+
+    @property
+    def iterations(self) -> int:
+        """Pose estimations per cloud; without pose awareness a second one would repeat the first."""
+        return self.network_options.iterations if self.network_options.pose_aware else 1
 
     def part_labels(self, hypothesis: Hypotheses, points: Tensor) -> Tensor:
         """[B, N] part of every point: the posed part of a single hypothesis that lies nearest."""
@@ -147,13 +153,12 @@ class ArticulatedPoseModule(LightningModule):
     def iterate(self, points: Tensor) -> list[Hypotheses]:
         """Hypotheses of every iteration for aligned clouds; each starts from the winner of the one before."""
         results, estimate, labels = [], None, None
-        for _ in range(self.network_options.iterations):
-            hypotheses = self.articulated(points, estimate, labels)
-            results.append(hypotheses)
-            if self.network_options.pose_aware:
-                winner, _ = winning_hypothesis(hypotheses, points, self.objective.unidirectional)
-                estimate = hypotheses.select(winner)
+        for _ in range(self.iterations):
+            if results:
+                winner, _ = winning_hypothesis(results[-1], points, self.objective.unidirectional)
+                estimate = results[-1].select(winner)
                 labels = self.part_labels(estimate, points)
+            results.append(self.articulated(points, estimate, labels))
         return results
 
     @torch.no_grad()
@@ -165,15 +170,17 @@ class ArticulatedPoseModule(LightningModule):
         """
         if not torch.isfinite(points).all():
             raise ValueError("a cloud has NaN or infinite points")
+        with torch.autocast(points.device.type, enabled=False):
+            return self._predict_points(points, self.inference.refine if refine is None else refine)
+
+    def _predict_points(self, points: Tensor, refine: bool) -> Prediction:
         aligned, pose = self.align(points)
         hypotheses = self.iterate(aligned)[-1]
         distance = hypothesis_distances(
             aligned, hypotheses.posed().flatten(2, 3), bidirectional=not self.objective.unidirectional
         )
-        if self.inference.refine if refine is None else refine:
-            chosen = self._refine(hypotheses, aligned, distance)
-        else:
-            chosen = hypotheses.select(distance.argmin(dim=1))
+        best = hypotheses.select(distance.argmin(dim=1))
+        chosen = self._refine(hypotheses, aligned, distance) if refine else best
         return self._prediction(chosen.at(pose[:, None] @ chosen.base, chosen.state), points)
 
     def _refine(self, hypotheses: Hypotheses, points: Tensor, distance: Tensor) -> Hypotheses:
@@ -215,7 +222,10 @@ class ArticulatedPoseModule(LightningModule):
         template = LabelledTemplate(shape.flatten(1, 2).repeat_interleave(copies, dim=0), label, self.num_parts)
         pivot = hypotheses.pivot.detach().repeat_interleave(copies, dim=0)
         joints = JointModel(hypotheses.chain, axis.detach(), pivot, hypotheses.joint_type)
-        return register_articulated(template, joints, points, base.detach(), state.detach(), scales, rounds)
+        bidirectional = not self.objective.unidirectional
+        return register_articulated(
+            template, joints, points, base.detach(), state.detach(), scales, rounds, bidirectional
+        )
 
     def _prediction(self, chosen: Hypotheses, points: Tensor) -> Prediction:
         """Package one hypothesis per cloud."""
@@ -243,7 +253,9 @@ class ArticulatedPoseModule(LightningModule):
             joint_state=chosen.state[:, 0],
             canonical_axis=axis,
             canonical_pivot=pivot,
-            reconstruction_error=chamfer(points, chosen.posed()[:, 0].flatten(1, 2)),
+            reconstruction_error=chamfer(
+                points, chosen.posed()[:, 0].flatten(1, 2), bidirectional=not self.objective.unidirectional
+            ),
         )
 
     def predict_cloud(
@@ -300,13 +312,23 @@ class ArticulatedPoseModule(LightningModule):
         held = step < self.schedule.rigid_steps + self.schedule.warmup_steps
         return 0.0 if held else self.schedule.category_rate * self.network_rate(step)
 
+    def setup(self, stage: str) -> None:
+        """Mixed precision, if the trainer asks for it, is for the backbones."""
+        mixed = "mixed" in str(self.trainer.precision)
+        for network in (self.articulated, self.rigid):
+            if network is not None:
+                network.mixed_precision = mixed
+
     def on_train_start(self) -> None:
         """Remember how many points a cloud has."""
         self.num_points = self.trainer.datamodule.hparams.num_points
 
     def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
-        """One step of whichever stage the schedule is in."""
-        points = split_labels(batch)[0]["points"]
+        """One step of whichever stage the schedule is in; under autocast only the backbones run in low precision."""
+        with torch.autocast(self.device.type, enabled=False):
+            return self._training_step(split_labels(batch)[0]["points"].float())
+
+    def _training_step(self, points: Tensor) -> Tensor:
         self._track_radius(points)
         if self.global_step < self.schedule.rigid_steps:
             loss = self._rigid_loss(points)
@@ -348,7 +370,7 @@ class ArticulatedPoseModule(LightningModule):
     def _warmup_step(self, size: int) -> Tensor:
         """Registered clouds under fresh rotations: poses are known, so the hypothesis nearest to them trains."""
         device = self.device
-        generator = torch.Generator().manual_seed(hash((self.global_step, self.global_rank)) % 2**31)
+        generator = torch.Generator().manual_seed(self.global_step * self.trainer.world_size + self.global_rank)
         index = torch.randint(len(self.registered["points"]), (size,), generator=generator)
         rotation = roma.unitquat_to_rotmat(
             torch.nn.functional.normalize(torch.randn(size, 4, generator=generator), dim=-1)
@@ -360,14 +382,14 @@ class ArticulatedPoseModule(LightningModule):
         losses, estimate, labels = [], None, None
         target = PoseTarget(base, state)
         category = self.articulated.object_template()
-        for _ in range(self.network_options.iterations):
+        for iteration in range(self.iterations):
             hypotheses = self.articulated(aligned, estimate, labels)
             start = torch.eye(3, device=device) if estimate is None else estimate.base[:, 0, :3, :3]
             nearest = self.group.nearest(start.transpose(-1, -2) @ base[:, :3, :3])
             selected = hypotheses.select(nearest)
             terms = staged_terms(selected, aligned, category, self.objective, target, follow_category=True)
             losses.append(terms.loss)
-            if self.network_options.pose_aware:
+            if iteration + 1 < self.iterations:
                 winner, _ = winning_hypothesis(hypotheses, aligned, self.objective.unidirectional)
                 estimate = hypotheses.select(winner)
                 labels = self.part_labels(estimate, aligned)
@@ -424,11 +446,11 @@ class ArticulatedPoseModule(LightningModule):
     def _discover(self) -> None:
         """Part discovery on a fixed subset of the training clouds; the same on every rank."""
         options = self.discovery
-        batches = [split_labels(b)[0] for b in self.trainer.datamodule.calibration_dataloader(options.clouds)]
+        batches = [split_labels(b)[0] for b in self.trainer.datamodule.discovery_dataloader(options.clouds)]
         dense = torch.cat([b["dense_points"] for b in batches]).float()
         with torch.random.fork_rng(devices=[]):
             found = discover(dense, self.num_parts, self.articulated.joint_type, options)
-        kept = found.error.argsort()[: int(options.keep * len(dense))]
+        kept = found.error.argsort()[: max(1, int(options.keep * len(dense)))]
         self.registered = {
             "points": dense[kept, : self.num_points],
             "base": found.base[kept],
@@ -494,4 +516,6 @@ class ArticulatedPoseModule(LightningModule):
         """Write metrics.json, metrics.csv and the picture of best, median and worst samples."""
         folder = Path(self.trainer.log_dir or self.trainer.default_root_dir)
         data = self.trainer.datamodule
-        self.test_report.write(folder, data.manifest, str(self.trainer.ckpt_path), self.inference.refine)
+        metrics = self.test_report.metrics.compute()  # on every rank: it gathers
+        if self.trainer.is_global_zero:
+            self.test_report.write(folder, metrics, data.manifest, str(self.trainer.ckpt_path), self.inference.refine)

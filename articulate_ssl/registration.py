@@ -87,12 +87,14 @@ class JointModel:
 def chamfer_l1(
     clouds: Tensor,  # [n, N, 3]
     posed: Tensor,  # [n, T, 3]
+    bidirectional: bool = True,
 ) -> Tensor:  # [n]
-    """Bidirectional mean nearest distance."""
+    """Mean nearest distance of the clouds to the shapes, plus with `bidirectional` that of the shapes to the clouds."""
     errors = []
     for cloud, shape in _batches(clouds, posed):
         distance = torch.cdist(cloud, shape)
-        errors.append(distance.amin(dim=2).mean(dim=1) + distance.amin(dim=1).mean(dim=1))
+        error = distance.amin(dim=2).mean(dim=1)
+        errors.append(error + distance.amin(dim=1).mean(dim=1) if bidirectional else error)
     return torch.cat(errors)
 
 
@@ -156,6 +158,7 @@ def register_articulated(
     state: Tensor,  # [n, J] start
     scales: tuple[float, float],
     rounds: int,
+    bidirectional: bool = True,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Register an articulated template without leaving its joints.
 
@@ -170,7 +173,7 @@ def register_articulated(
         free = update_poses(template, joints.part_pose(base, state), clouds, scale)
         state = joints.read_states(template, free)
         base = _register(template.posed(joints.part_pose(still, state)), template.posed(free))
-    return base, state, chamfer_l1(clouds, template.posed(joints.part_pose(base, state)))
+    return base, state, chamfer_l1(clouds, template.posed(joints.part_pose(base, state)), bidirectional)
 
 
 def search_articulated(

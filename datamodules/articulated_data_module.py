@@ -179,6 +179,14 @@ class ArticulatedDataModule(LightningDataModule):
         dataset = ArticulatedDataset(folder, "train", options.num_points, rotate, verify=options.verify)
         return self._loader(dataset, EvaluationSampler(spread_subset(dataset.labels["instance"], samples)))
 
+    def discovery_dataloader(self, samples: int) -> DataLoader:
+        """Training clouds spread evenly over the split, chosen without looking at any label; as for calibration."""
+        dataset = ArticulatedDataset(
+            self.folder, "train", self.hparams.num_points, self.manifest.view == "complete", verify=self.hparams.verify
+        )
+        chosen = np.unique(np.linspace(0, len(dataset) - 1, min(samples, len(dataset))).round().astype(int))
+        return self._loader(dataset, EvaluationSampler(np.random.default_rng(self.hparams.seed).permutation(chosen)))
+
     def on_before_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
         """Count what training consumes here, where loaders cannot run ahead of it."""
         if self.trainer is not None and self.trainer.training:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
+from torchmetrics.utilities import dim_zero_cat
 
 from articulate_ssl.inference.picture import SampleRow, draw_test_samples
 from articulate_ssl.metrics.articulated_pose import ArticulatedPoseMetrics
@@ -56,14 +57,20 @@ class TestReport:
             (batch["points"].cpu(), batch["dense_part_id"].gather(1, nearest).cpu(), prediction.to("cpu"))
         )
 
-    def write(self, folder: Path, manifest: Manifest, checkpoint: str, refined: bool) -> dict:
-        """Write metrics.json, metrics.csv and the picture; print the table.
+    def write(self, folder: Path, result: dict, manifest: Manifest, checkpoint: str, refined: bool) -> dict:
+        """Write metrics.json, metrics.csv and the picture (of this process's clouds); print the table.
+
+        Args:
+            folder: Where to.
+            result: What `metrics.compute()` returned.
+            manifest: Of the test set.
+            checkpoint: Path of the weights.
+            refined: Whether predictions were refined by registration.
 
         Returns:
             The content of metrics.json.
         """
-        error = torch.cat(self.metrics.r_err_deg).mean(dim=1).cpu()
-        result = self.metrics.compute()
+        error = dim_zero_cat(self.metrics.r_err_deg).mean(dim=1).cpu()
         content = write_report(
             folder,
             result,

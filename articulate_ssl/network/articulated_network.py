@@ -128,6 +128,7 @@ class ArticulatedNetwork(nn.Module):
         self.num_parts, self.shape_points, self.joint_type = num_parts, shape_points, joint_type
         self.state_bound, self.flow_bound, self.stretch_bound = state_bound, flow_bound, stretch_bound
         self.part_features, self.shared_axis = part_features, shared_axis
+        self.mixed_precision = False  # of the backbone; geometry needs full precision
         self.register_buffer("elements", elements, persistent=False)
         self.register_buffer("pairs", pairs, persistent=False)
 
@@ -179,7 +180,9 @@ class ArticulatedNetwork(nn.Module):
         else:
             points_in = points
         mean = points_in.mean(dim=1, keepdim=True)
-        features = self.backbone(points_in)
+        with torch.autocast(points.device.type, torch.bfloat16, enabled=self.mixed_precision):
+            features = self.backbone(points_in)
+        features = features.to(points.dtype)
         centers = points_in[:, : features.shape[1]] - mean
 
         logits = self.part_proposal(self.point_pool(features)).to(points.dtype)

@@ -51,6 +51,7 @@ class RigidAlignment(nn.Module):
         self.pose_head = nn.Sequential(nn.Linear(dim, dim), nn.LeakyReLU(0.1), nn.Linear(dim, 6))
         self.flow_head = nn.Sequential(nn.Linear(dim, dim), nn.LeakyReLU(0.1), nn.Linear(dim, 3 * shape_points))
         self.flow_bound = flow_bound
+        self.mixed_precision = False  # of the backbone; geometry needs full precision
         self.template = nn.Parameter(0.2 * torch.randn(shape_points, 3))
         for head in (self.pose_head, self.flow_head):
             nn.init.normal_(head[-1].weight, std=1e-3)
@@ -58,7 +59,9 @@ class RigidAlignment(nn.Module):
 
     def forward(self, points: Tensor) -> RigidHypotheses:
         """Hypotheses for clouds [B, N, 3]."""
-        features = self.backbone(points)
+        with torch.autocast(points.device.type, torch.bfloat16, enabled=self.mixed_precision):
+            features = self.backbone(points)
+        features = features.to(points.dtype)
         centers = points[:, : features.shape[1]]
         mean = points.mean(dim=1, keepdim=True)
         whole = (

@@ -36,6 +36,10 @@ from datamodules.geometry import PRISMATIC, invert_se3, screw_motion, se3, trans
 log = logging.getLogger(__name__)
 
 
+class DiscoveryError(RuntimeError):
+    """The clouds do not show the parts that were asked for."""
+
+
 @dataclass(frozen=True)
 class DiscoveryOptions:
     """How much work part discovery does.
@@ -98,7 +102,7 @@ def discover(
     """Parts and joints of the category, registered to all the clouds.
 
     Raises:
-        RuntimeError: if no split into `num_parts` moving parts survives.
+        DiscoveryError: if no split into `num_parts` moving parts survives.
     """
     clouds = clouds[:, : options.points].contiguous()
     reference = clouds[choose_reference(clouds)]
@@ -115,12 +119,15 @@ def discover(
 
     for step in range(options.rounds):
         base, state, error = _search(found, few, rotations)
-        kept = error.argsort()[: int(options.keep * len(few))]
+        kept = error.argsort()[: max(1, int(options.keep * len(few)))]
         pose = found.joints.part_pose(base[kept], state[kept])
         template = found.template
         for scale in (0.03, 0.028, 0.026, 0.024, 0.022, 0.02):
             pose = update_poses(template, pose, few[kept], scale)
             template = relabel(template, pose, few[kept], cap=4 * scale)
+        if torch.bincount(template.label, minlength=num_parts).min() < options.min_share * len(template.label):
+            log.warning("round %d lost a part; keeping the parts of the round before", step + 1)
+            break
         found = fit_joints(template, pose, few[kept], joint_type)
         log.info("round %d: Chamfer-L1 %.4f of the kept clouds", step + 1, found.error.mean())
     base, state, error = _search(found, clouds, rotations)
@@ -153,7 +160,7 @@ def dense_template(
     cloud = clouds[reference]
     nearest = torch.cdist(cloud, found.template.posed(pose[reference, None])[0]).argmin(dim=1)
     label = found.template.label[nearest]
-    kept = found.error.argsort()[: int(keep * len(clouds))]
+    kept = found.error.argsort()[: max(1, int(keep * len(clouds)))]
     rows = torch.arange(len(cloud), device=cloud.device)
     for _ in range(2):
         canonical = transform_points(inverse, cloud)[label, rows]
@@ -186,7 +193,7 @@ def split_template(
     """Best of many random splits after multi-body registration.
 
     Raises:
-        RuntimeError: if every start loses a part.
+        DiscoveryError: if every start loses a part.
     """
     generator = torch.Generator().manual_seed(options.seed)
     best: ArticulatedTemplate | None = None
@@ -204,7 +211,7 @@ def split_template(
         if best is None or found.error.mean() < best.error.mean():
             best = found
     if best is None:
-        raise RuntimeError(
+        raise DiscoveryError(
             f"part discovery lost a part in all {options.starts} starts: the clouds do not show {num_parts} parts that "
             "move on their own; check the category's number of parts, or allow more starts"
         )
