@@ -381,7 +381,7 @@ class ArticulatedPoseModule(LightningModule):
         base = invert_se3(pose) @ turn @ base
         losses, estimate, labels = [], None, None
         target = PoseTarget(base, state)
-        category = self.articulated.object_template()
+        category = self.articulated.category_object()
         for iteration in range(self.iterations):
             hypotheses = self.articulated(aligned, estimate, labels)
             start = torch.eye(3, device=device) if estimate is None else estimate.base[:, 0, :3, :3]
@@ -399,7 +399,7 @@ class ArticulatedPoseModule(LightningModule):
     def _staged_step(self, points: Tensor) -> Tensor:
         """Any training cloud: the best reconstruction trains, drawn to where a few rounds of registration move it."""
         aligned, _ = self.align(points)
-        category = self.articulated.object_template()
+        category = self.articulated.category_object()
         losses = []
         for hypotheses in self.iterate(aligned):
             winner, before = winning_hypothesis(hypotheses, aligned, self.objective.unidirectional)

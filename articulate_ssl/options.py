@@ -55,8 +55,8 @@ class ObjectiveOptions:
         joint_regularization: The paper's lambda; 0 is its ablation of L_reg.
         joint_extent: Half length of the stretch of joint line that L_reg pulls to the parts, in normalised units.
         distillation: Weight of the distance between predicted and registered poses (staged recipe).
-        deviation: Weight of the squared distance between an instance's canonical object and the category's (staged
-            recipe). Without it shapes and poses drift together: registered poses move the instance's own shapes.
+        deviation: Weight of the squared distance between an instance's canonical object and joint lines and the
+            category's (staged recipe). Without it they drift together with the poses.
         segmentation: Weight of the cross-entropy between part proposal and posterior association (staged recipe).
         posterior_scale: Standard deviation of the posterior association, in normalised units (staged recipe).
     """

@@ -8,6 +8,7 @@ quantities that depend on the pose (base transformation, axes, joint states) are
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import roma
 import torch
@@ -92,6 +93,14 @@ class Hypotheses:
         return replace(self, base=base, state=state)
 
 
+class CategoryObject(NamedTuple):
+    """What the instances of a category have in common, in canonical object space."""
+
+    shape: Tensor  # [K, M, 3]
+    axis: Tensor  # [E, 3] unit, of all part pairs
+    pivot: Tensor  # [E, 3]
+
+
 class ArticulatedNetwork(nn.Module):
     """Backbone, part proposal and heads. Category-level quantities are parameters; heads predict what an instance adds.
 
@@ -158,9 +167,10 @@ class ArticulatedNetwork(nn.Module):
         self.register_buffer("principal_axes", torch.eye(3).repeat(num_parts, 1, 1))
         self.register_buffer("mean_confidence", torch.zeros(len(pairs)))
 
-    def object_template(self) -> Tensor:
-        """The category's canonical object, [K, M, 3]."""
-        return self.template + self.assembly[:, None]
+    def category_object(self) -> CategoryObject:
+        """The category's canonical object and joints."""
+        shape = self.template + self.assembly[:, None]
+        return CategoryObject(shape, functional.normalize(self.axis, dim=-1), self.pivot)
 
     def chain(self) -> KinematicChain:
         """The category's kinematic chain, from the running mean of the predicted adjacency confidences."""

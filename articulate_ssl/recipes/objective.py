@@ -16,7 +16,7 @@ from articulate_ssl.losses.reconstruction import (
     posterior_association,
     whole_shape,
 )
-from articulate_ssl.network.articulated_network import Hypotheses
+from articulate_ssl.network.articulated_network import CategoryObject, Hypotheses
 from articulate_ssl.ops.chamfer import hypothesis_distances, nearest_index
 from articulate_ssl.options import ObjectiveOptions
 
@@ -78,7 +78,7 @@ def paper_terms(winner: Hypotheses, points: Tensor, options: ObjectiveOptions) -
 def staged_terms(
     selected: Hypotheses,
     points: Tensor,  # [B, N, 3]
-    category: Tensor,  # [K, M, 3] the category's canonical object
+    category: CategoryObject,
     options: ObjectiveOptions,
     target: PoseTarget | None,
     follow_category: bool,
@@ -104,7 +104,7 @@ def staged_terms(
             shape = goal
             if follow_category:
                 pose = at_target.object_pose()[:, 0]
-                shape = torch.einsum("bkij,kmj->bkmi", pose[..., :3, :3], category) + pose[..., None, :3, 3]
+                shape = torch.einsum("bkij,kmj->bkmi", pose[..., :3, :3], category.shape) + pose[..., None, :3, 3]
             explained = distances_to_parts(points, shape)
         distillation = (posed - goal).norm(dim=-1).mean()
     association = posterior_association(explained, options.posterior_scale)
@@ -115,7 +115,14 @@ def staged_terms(
     segmentation = functional.cross_entropy(
         selected.association_logits.flatten(0, 1), association[:, :centers].flatten(0, 1)
     )
-    deviation = (selected.object_shape() - category).square().sum(dim=-1).mean()
+    deviation = sum(
+        (instance - common).square().sum(dim=-1).mean()
+        for instance, common in (
+            (selected.object_shape(), category.shape),
+            (selected.pair_axis[:, 0], category.axis),
+            (selected.pair_pivot, category.pivot),
+        )
+    )
     joints = _joint_term(selected, options)
     loss = (
         reconstruction
