@@ -98,6 +98,7 @@ class ArticulatedDataModule(LightningDataModule):
             if value is not None and value < least:
                 raise ValueError(f"{name}={value}, must be at least {least}")
         self.save_hyperparameters(logger=False)
+        self.hparams["protocol"] = protocol  # under LightningCLI the line above saves what the user gave
         self.consumed_samples = 0
 
     @property
