@@ -309,5 +309,6 @@ def _fit_screw(relative: Tensor, joint_type: int) -> tuple[Tensor, Tensor, Tenso
     eye = torch.eye(3).to(relative)
     system = torch.cat([torch.cat([rotation, eye - rotation], dim=2).flatten(0, 1), 1e-3 * torch.eye(6).to(relative)])
     rhs = torch.cat([relative[:, :3, 3].flatten(), relative.new_zeros(6)])
-    solution = torch.linalg.lstsq(system, rhs[:, None]).solution.squeeze(-1)
+    # Of full rank by the ridge. The CPU's default driver rounds differently from call to call; this one does not.
+    solution = torch.linalg.lstsq(system, rhs[:, None], driver="gels").solution.squeeze(-1)
     return axis, solution[3:], state, se3(mean_rotation, solution[:3])
