@@ -1,0 +1,88 @@
+"""Clouds of simple articulated objects with known parts, poses and joints, in farthest-point-like random order."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import roma
+import torch
+from torch import Tensor
+
+from datamodules.geometry import PRISMATIC, REVOLUTE, forward_kinematics, screw_motion, se3, transform_points
+
+
+class Clouds(NamedTuple):
+    """n clouds of an object: points [n, N, 3] of parts [N], base poses [n, 4, 4], states [n, J], joints [J, 3]."""
+
+    points: Tensor
+    rest: Tensor  # [N, 3]
+    part: Tensor
+    base: Tensor
+    state: Tensor
+    axis: Tensor
+    pivot: Tensor
+
+
+# Corners of each part's box, parent of each part but the first, axis and pivot of its joint, range of its state.
+LAPTOP = (
+    [((0, 0, 0), (0.6, 0.7, 0.05)), ((0, 0, 0.06), (0.5, 0.7, 0.08))],
+    (0,),
+    [((0, 1, 0), (0, 0, 0.06))],
+    [(-1.6, -0.3)],
+    REVOLUTE,
+)
+DRAWER = (
+    [((0, 0, 0), (0.4, 0.6, 0.5)), ((0.05, 0.05, 0.1), (0.42, 0.55, 0.25))],
+    (0,),
+    [((1, 0, 0), (0, 0, 0))],
+    [(0.05, 0.4)],
+    PRISMATIC,
+)
+GLASSES = (
+    [
+        ((0, -0.35, 0), (0.04, 0.35, 0.2)),
+        ((0.04, 0.31, 0.12), (0.55, 0.35, 0.18)),
+        ((0.04, -0.35, 0.12), (0.55, -0.31, 0.18)),
+    ],
+    (0, 0),
+    [((0, 0, 1), (0.04, 0.33, 0.15)), ((0, 0, -1), (0.04, -0.33, 0.15))],
+    [(-1.3, 0.0), (-1.3, 0.0)],
+    REVOLUTE,
+)
+
+
+def clouds(
+    design=LAPTOP, count: int = 6, points: int = 128, resample: bool = False, rotate: bool = True, seed: int = 0
+) -> Clouds:
+    """Clouds of one object at random states and orientations; `resample` draws other surface points for each."""
+    generator = torch.Generator().manual_seed(seed)
+    boxes, parents, joints, ranges, joint_type = design
+    K = len(boxes)
+    low, high = (torch.tensor([box[i] for box in boxes]).float() for i in (0, 1))
+    part = torch.arange(points) % K
+
+    def surface() -> Tensor:
+        inside = torch.rand(points, 3, generator=generator)
+        area = (high - low).roll(1, dims=1) * (high - low).roll(2, dims=1)  # of the faces across each axis
+        across = torch.multinomial(area, points, replacement=True, generator=generator)[part, torch.arange(points)]
+        inside[torch.arange(points), across] = (inside[torch.arange(points), across] > 0.5).float()
+        return low[part] + inside * (high - low)[part]
+
+    axis, pivot = (torch.tensor([joint[i] for joint in joints]).float() for i in (0, 1))
+    lower, upper = torch.tensor(ranges).T
+    state = lower + (upper - lower) * torch.rand(count, len(joints), generator=generator)
+    rotation = torch.eye(3).repeat(count, 1, 1)
+    if rotate:
+        rotation = roma.unitquat_to_rotmat(roma.quat_normalize(torch.randn(count, 4, generator=generator)))
+    rest = surface()
+    motion = forward_kinematics(
+        screw_motion(axis.expand(count, -1, 3), pivot.expand(count, -1, 3), state, joint_type),
+        parents,
+        range(1, K),
+        K,
+    )
+    shapes = torch.stack([surface() if resample else rest for _ in range(count)])
+    posed = transform_points(motion[:, part], shapes[:, :, None])[:, :, 0]
+    center = posed.mean(dim=1)
+    base = se3(rotation, -(rotation @ center[..., None]).squeeze(-1))
+    return Clouds(transform_points(base, posed), rest, part, base, state, axis, pivot)

@@ -1,0 +1,103 @@
+"""Exit codes and messages of the command line, in this process."""
+
+import sys
+
+import pytest
+import torch
+import yaml
+from synthetic import write_synthetic_set
+from tiny import NETWORK, POINTS, fit, tiny_module
+
+from articulate_ssl.cli import main
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory):
+    """A folder with a data set, a configuration and a trained checkpoint."""
+    folder = tmp_path_factory.mktemp("cli")
+    write_synthetic_set(folder)
+    config = {
+        "data": {"category": "laptop", "root": str(folder), "num_points": POINTS, "batch_size": 4},
+        "model": {
+            "num_parts": 2,
+            "calibration_samples": 8,
+            "network": {k: getattr(NETWORK, k) for k in NETWORK.__dataclass_fields__},
+        },
+        "trainer": {"max_steps": 1, "accelerator": "cpu", "default_root_dir": str(folder / "runs")},
+    }
+    (folder / "laptop.yaml").write_text(yaml.safe_dump(config))
+    module = tiny_module(recipe="paper")
+    fit(module, folder, 1).save_checkpoint(folder / "trained.ckpt")
+    return folder
+
+
+@pytest.fixture
+def run(workplace, monkeypatch, capsys):
+    monkeypatch.chdir(workplace)
+    monkeypatch.setattr(sys, "argv", ["lightning"])
+
+    def run(*arguments) -> tuple[int, str]:
+        try:
+            code = main([str(a) for a in arguments])
+        except SystemExit as error:  # jsonargparse refuses arguments so
+            code = error.code
+        return code, capsys.readouterr().err
+
+    return run
+
+
+def _refused(result, *words):
+    code, message = result
+    assert code == 2
+    assert "Traceback" not in message
+    for word in words:
+        assert word in message
+
+
+def test_a_test_without_a_checkpoint_is_refused(run):
+    _refused(run("test", "-c", "laptop.yaml"), "no checkpoint", "lightning fit")
+
+
+def test_a_missing_or_truncated_checkpoint_is_refused(run, workplace):
+    _refused(run("test", "-c", "laptop.yaml", "--ckpt_path", "nowhere.ckpt"), "nowhere.ckpt")
+    content = (workplace / "trained.ckpt").read_bytes()
+    (workplace / "cut.ckpt").write_bytes(content[: len(content) // 2])
+    _refused(run("test", "-c", "laptop.yaml", "--ckpt_path", "cut.ckpt"), "cut.ckpt", "damaged")
+
+
+def test_a_checkpoint_of_another_category_is_refused(run, workplace):
+    content = torch.load(workplace / "trained.ckpt", weights_only=True)
+    content["hyper_parameters"]["category"] = "oven"
+    torch.save(content, workplace / "oven.ckpt")
+    _refused(run("test", "-c", "laptop.yaml", "--ckpt_path", "oven.ckpt"), "oven.ckpt", "'oven'", "'laptop'")
+
+
+@pytest.mark.parametrize("key", ["--model.network.group_ordr=12", "--model.recpie=paper", "--data.batchsize=3"])
+def test_a_misspelt_key_is_refused(run, key):
+    _refused(run("fit", "-c", "laptop.yaml", key), key.split("=")[0].split(".")[-1])
+
+
+def test_a_misspelt_key_in_a_file_is_refused(run, workplace):
+    (workplace / "bad.yaml").write_text("model:\n  objective:\n    joint_regularisation: 0\n")
+    _refused(run("fit", "-c", "laptop.yaml", "-c", "bad.yaml"), "joint_regularisation")
+
+
+def test_an_impossible_value_is_refused(run):
+    _refused(run("fit", "-c", "laptop.yaml", "--model.recipe=magic"), "recipe")
+    _refused(run("fit", "-c", "laptop.yaml", "--model.network.group_order=13"), "rotation group")
+
+
+def test_missing_data_are_refused_with_the_command_that_makes_them(run, tmp_path):
+    _refused(run("fit", "-c", "laptop.yaml", f"--data.root={tmp_path}"), "make data CAT=laptop")
+
+
+def test_a_missing_cloud_is_refused(run):
+    _refused(run("predict", "nowhere.ply", "--ckpt", "trained.ckpt"), "nowhere.ply")
+
+
+def test_a_test_writes_its_metrics(run, workplace):
+    code, _ = run("test", "-c", "laptop.yaml", "--ckpt_path", "trained.ckpt", "--model.recipe=paper")
+    assert code == 0
+    found = list((workplace / "runs").rglob("metrics.json"))
+    assert len(found) == 1
+    assert {p.name for p in found[0].parent.iterdir()} >= {"metrics.json", "metrics.csv", "test_samples.png"}
