@@ -150,6 +150,9 @@ def dense_template(
 
     Parts that lie against each other (a closed laptop) cannot be told apart in one cloud, hence a cloud near the mean
     state, and hence the labels from which part's motion explains a point in the other clouds.
+
+    Raises:
+        DiscoveryError: if a part is left without points.
     """
     clouds = clouds[:, :points]
     distance = (found.state / found.state.std(dim=0)).abs().amax(dim=1)
@@ -166,6 +169,12 @@ def dense_template(
         canonical = transform_points(inverse, cloud)[label, rows]
         template = LabelledTemplate(canonical, label, found.template.num_parts)
         label = relabel(template, pose[kept], clouds[kept], cap=0.04).label
+    counts = torch.bincount(label, minlength=found.template.num_parts)
+    if counts.min() < 4:
+        raise DiscoveryError(
+            f"part discovery lost a part (points per part: {counts.tolist()}): the clouds do not show "
+            f"{found.template.num_parts} parts that move on their own; check the category's number of parts"
+        )
     return LabelledTemplate(transform_points(inverse, cloud)[label, rows], label, found.template.num_parts)
 
 

@@ -1,7 +1,9 @@
 """Exit codes and messages of the command line, in this process."""
 
+import json
 import sys
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -101,3 +103,22 @@ def test_a_test_writes_its_metrics(run, workplace):
     found = list((workplace / "runs").rglob("metrics.json"))
     assert len(found) == 1
     assert {p.name for p in found[0].parent.iterdir()} >= {"metrics.json", "metrics.csv", "test_samples.png"}
+    metrics = json.loads(found[0].read_text())
+    statistics = ("r_err_deg", "t_err", "axis_err_deg", "pivot_err", "state_err", "seg_miou", "chamfer_l1", "flip_rate")
+    for name in (*statistics, "legacy_r_err_deg"):
+        assert {"mean", "median", "ci95"} <= set(metrics[name]), name
+    assert metrics["samples"] > 0 and metrics["failures"] == 0
+    for name in ("protocol", "category", "source", "checkpoint", "seconds_per_cloud"):
+        assert name in metrics
+
+
+def test_a_checkpoint_of_other_network_sizes_is_refused(run):
+    command = ("test", "-c", "laptop.yaml", "--ckpt_path", "trained.ckpt", "--model.network.head_dim=16")
+    _refused(run(*command), "trained.ckpt", "network sizes")
+
+
+def test_a_scan_gives_a_folder_of_results(run, workplace):
+    np.save(workplace / "scan.npy", np.random.default_rng(0).normal(size=(500, 3)) * [30, 20, 2] + 100)
+    assert run("predict", "scan.npy", "--ckpt", "trained.ckpt", "--out", "result")[0] == 0
+    files = {p.name for p in (workplace / "result").iterdir()}
+    assert files >= {"prediction.json", "parts.ply", "reconstruction.ply", "object.urdf", "picture.png"}

@@ -120,20 +120,22 @@ def test_a_checkpoint_that_does_not_fit_is_refused(trained, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "stop"),
+    ("options", "stop", "steps"),
     [
-        ({}, 3),  # discovery before the stop, in the middle of self-supervision
-        ({"recipe": "paper"}, 3),
+        ({"warmup_steps": 40}, 50, 100),  # discovery before the stop, in the middle of self-supervision
+        ({"rigid_steps": 3, "warmup_steps": 1}, 2, 6),  # in stage 0
+        ({"recipe": "paper"}, 50, 100),
     ],
+    ids=str,
 )
-def test_resuming_gives_the_weights_of_never_stopping(tmp_path, root, options, stop):
-    whole, first, second = (tiny_module(**options) for _ in range(3))
-    fit(whole, root, 6)
+def test_resuming_gives_the_weights_of_never_stopping(tmp_path, root, options, stop, steps):
+    whole, first, second = (tiny_module(steps, **options) for _ in range(3))
+    fit(whole, root, steps)
     fit(first, root, stop).save_checkpoint(tmp_path / "half.ckpt")
     with torch.no_grad():  # a resumed module starts from other weights
         for parameter in second.parameters():
             parameter.add_(1.0)
-    fit(second, root, 6, tmp_path / "half.ckpt")
+    fit(second, root, steps, tmp_path / "half.ckpt")
     for name, value in whole.state_dict().items():
         torch.testing.assert_close(second.state_dict()[name], value, rtol=0, atol=0, msg=name)
 
