@@ -3,7 +3,7 @@
 Symbols: S samples, P points of a cloud, K parts, J joints. Everything is in normalised units,
 `points = (metric points - center) / scale`; camera space is the space of `points`. Radians.
 
-    points           camera space, farthest-point ordered: the first N are an even sample of the cloud
+    points           camera space, farthest-point ordered (partial clouds: the first 2048): a prefix is an even sample
     part_id          part of every point
     part_pose        canonical object frame / scale -> camera space
     part_center      rest-state bounding-box centre of each part, canonical object frame / scale
