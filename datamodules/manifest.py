@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from datamodules.atomic import atomic_write
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 MANIFEST_NAME = "manifest.json"
 SPLITS = ("train", "test")
 VIEWS = ("complete", "partial")
@@ -51,6 +51,7 @@ class Manifest:
             (divide by `scale` of a sample to compare with its `joint_state`).
         shards: Shards of each split, in the order of the global sample index.
         rejected_views: Views that were drawn again because a part showed too few points.
+        left_out: Why, by id, objects of the source are not in the set. Sets of schema version 1 did not record this.
         schema_version: Version of this file's format.
     """
 
@@ -68,6 +69,7 @@ class Manifest:
     rest_state: dict[str, tuple[float, ...]]
     shards: dict[str, tuple[ShardEntry, ...]]
     rejected_views: int = 0
+    left_out: dict[str, str] = field(default_factory=dict)
     schema_version: int = SCHEMA_VERSION
 
     def __post_init__(self) -> None:
@@ -83,6 +85,8 @@ class Manifest:
         ids = [i for split in SPLITS for i in self.instances[split]]
         if len(set(ids)) != len(ids):
             raise ValueError("an instance id appears twice; splits must not share instances")
+        if both := set(ids) & set(self.left_out):
+            raise ValueError(f"instance {min(both)!r} is both in a split and left out")
         if set(self.rest_state) != set(ids):
             raise ValueError("rest_state must name exactly the instances of the splits")
         if not set(self.joint_types) <= {0, 1}:
@@ -129,11 +133,13 @@ class Manifest:
             raise ManifestError(f"{path}: manifest is not valid JSON ({error}). {remedy}") from error
         if not isinstance(content, dict):
             raise ManifestError(f"{path}: manifest is not a JSON object. {remedy}")
+        if content.get("schema_version") == 1:
+            content = {"left_out": {}} | content | {"schema_version": SCHEMA_VERSION}
         if (version := content.get("schema_version")) != SCHEMA_VERSION:
             raise ManifestError(
                 f"{path}: schema version is {version!r}, this program reads version {SCHEMA_VERSION}. {remedy}"
             )
-        expected = {field.name for field in fields(cls)}
+        expected = {attribute.name for attribute in fields(cls)}
         if difference := expected.symmetric_difference(content):
             kind = "missing" if difference & expected else "unknown"
             raise ManifestError(f"{path}: manifest has {kind} fields: {', '.join(sorted(difference))}. {remedy}")
@@ -144,6 +150,7 @@ class Manifest:
                     "part_names": tuple(content["part_names"]),
                     "joint_types": tuple(content["joint_types"]),
                     "articulation_range": tuple((low, high) for low, high in content["articulation_range"]),
+                    "left_out": {instance: str(reason) for instance, reason in content["left_out"].items()},
                     "instances": {split: tuple(ids) for split, ids in content["instances"].items()},
                     "rest_state": {instance: tuple(state) for instance, state in content["rest_state"].items()},
                     "shards": {s: tuple(ShardEntry(**entry) for entry in e) for s, e in content["shards"].items()},

@@ -28,7 +28,7 @@ from render.depth_renderer import DepthRenderer, RendererUnavailable
 from render.execution import run_tasks
 from render.partial_cloud import RENDERERS
 from render.shard_task import SetOptions, ShardResult, ShardTask, plan_shards
-from render.sources import SOURCES, Source, open_source
+from render.sources import SOURCES, Source, left_out_lines, open_source
 
 JOURNAL_NAME = ".journal.jsonl"
 
@@ -42,7 +42,9 @@ def generate(options: SetOptions, out: Path, workers: int, scheduler: str | None
     """
     folder = set_folder(out, options.category, options.source, options.view, options.protocol)
     ids = split_instances(options)
-    _report_left_out(options)
+    left_out = _left_out(options, ids)
+    for line in left_out_lines(left_out):
+        print(line, file=sys.stderr)
     for split in SPLITS:
         (folder / split).mkdir(parents=True, exist_ok=True)
     with _alone_in(folder):
@@ -52,7 +54,7 @@ def generate(options: SetOptions, out: Path, workers: int, scheduler: str | None
         if (folder / MANIFEST_NAME).exists():
             _repair(folder, options, tasks, workers, scheduler)
         else:
-            _complete(folder, options, ids, tasks, workers, scheduler)
+            _complete(folder, options, ids, left_out, tasks, workers, scheduler)
     return folder
 
 
@@ -60,6 +62,7 @@ def _complete(
     folder: Path,
     options: SetOptions,
     ids: dict[str, tuple[str, ...]],
+    left_out: dict[str, str],
     tasks: list[ShardTask],
     workers: int,
     scheduler: str | None,
@@ -73,7 +76,7 @@ def _complete(
         done[result.split, result.name] = result
         _require_same_structure(next(iter(done.values())), result)
     results = [done[task.split, task.name] for task in tasks]
-    _manifest(options, ids, results).save(folder)
+    _manifest(options, ids, left_out, results).save(folder)
     journal.path.unlink()
 
 
@@ -110,13 +113,15 @@ def _open(category: str, source: str, root: str | None, seed: int) -> Source:
     return open_source(source, load_category(category), None if root is None else Path(root), seed)
 
 
-def _report_left_out(options: SetOptions) -> None:
-    """Say on stderr which objects the source left out, one line for every reason."""
-    ids: dict[str, list[str]] = {}
-    for instance_id, reason in _open(options.category, options.source, options.root, options.seed).left_out().items():
-        ids.setdefault(reason, []).append(instance_id)
-    for reason in ids:
-        print(f"left out {len(ids[reason])} object(s), {reason}: {', '.join(ids[reason])}", file=sys.stderr)
+def _left_out(options: SetOptions, ids: dict[str, tuple[str, ...]]) -> dict[str, str]:
+    """Why, by id, objects of the source are not in the set; the procedural source has no end to be left out of."""
+    source = _open(options.category, options.source, options.root, options.seed)
+    left_out = dict(source.left_out())
+    if options.root is not None:
+        counts = f"--train-instances {options.train_instances} and --test-instances {options.test_instances}"
+        used = {instance_id for split in SPLITS for instance_id in ids[split]}
+        left_out |= dict.fromkeys((i for i in source.instance_ids() if i not in used), f"more than {counts} take")
+    return left_out
 
 
 def default_split(spec: CategorySpec, available: int) -> tuple[int, int]:
@@ -224,7 +229,9 @@ def _require_same_structure(first: ShardResult, other: ShardResult) -> None:
         )
 
 
-def _manifest(options: SetOptions, ids: dict[str, tuple[str, ...]], results: list[ShardResult]) -> Manifest:
+def _manifest(
+    options: SetOptions, ids: dict[str, tuple[str, ...]], left_out: dict[str, str], results: list[ShardResult]
+) -> Manifest:
     rest = {result.instance_id: tuple(result.rest_state) for result in results}
     ranges = [result.articulation_range for result in results]
     return Manifest(
@@ -247,6 +254,7 @@ def _manifest(options: SetOptions, ids: dict[str, tuple[str, ...]], results: lis
             for split in SPLITS
         },
         rejected_views=sum(result.rejected_views for result in results),
+        left_out=left_out,
     )
 
 

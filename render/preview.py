@@ -24,7 +24,7 @@ from render.partial_cloud import DepthSensor
 from render.posing import compose, sample_states
 from render.seeds import generator_for
 from render.shaded_picture import PART_COLORS, Viewpoint, frame, posed_vertices, shaded_picture
-from render.sources import SOURCES, open_source
+from render.sources import SOURCES, left_out_lines, open_source
 
 COLUMNS = 6
 _TILE = 240  # pixels
@@ -163,6 +163,8 @@ def main(argv: list[str] | None = None) -> int:
     try:
         source = open_source(arguments.source, spec, arguments.root, arguments.seed)
         ids = source.instance_ids()[: 2 * COLUMNS]
+        for line in left_out_lines(source.left_out()):
+            print(line, file=sys.stderr)
         instances = [spec.to_rest(source.load(instance_id)) for instance_id in ids]
         figure = contact_sheet(spec, instances, arguments.seed)
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -37,6 +37,16 @@ class Source(Protocol):
         """
 
 
+def left_out_lines(
+    left_out: dict[str, str],  # reason by id
+) -> list[str]:
+    """One line to read for every reason."""
+    ids: dict[str, list[str]] = {}
+    for instance_id, reason in left_out.items():
+        ids.setdefault(reason, []).append(instance_id)
+    return [f"left out {len(ids[reason])} object(s), {reason}: {', '.join(ids[reason])}" for reason in ids]
+
+
 def open_source(name: str, spec: CategorySpec, root: Path | None, seed: int) -> Source:
     """Open a source.
 

@@ -27,7 +27,7 @@ def test_saving_what_was_loaded_gives_the_same_bytes(synthetic_set, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"schema_version": 99}, "schema version is 99, this program reads version 1"),
+        ({"schema_version": 99}, "schema version is 99, this program reads version 2"),
         ({"schema_version": "remove"}, "schema version is None"),
         ({"seed": "remove"}, "missing fields: seed"),
         ({"mood": 1}, "unknown fields: mood"),
@@ -36,6 +36,8 @@ def test_saving_what_was_loaded_gives_the_same_bytes(synthetic_set, tmp_path):
         ({"instances": {"train": ["a"]}}, "names the splits"),
         ({"instances": {"train": ["a"], "test": ["a"]}}, "twice"),
         ({"rest_state": {}}, "rest_state"),
+        ({"left_out": {"train-0": "broken"}}, "'train-0' is both in a split and left out"),
+        ({"left_out": ["a"]}, "damaged"),
         ({"joint_types": [0, 0]}, "2 entries"),
         ({"joint_types": ["hinge"]}, "joint_types are"),
         ({"shards": {"train": [{"name": "a", "samples": 0, "sha256": ""}], "test": []}}, "a shard has no samples"),
@@ -48,6 +50,18 @@ def test_an_unsound_manifest_is_refused(synthetic_set, changes, message):
     edit(synthetic_set, **changes)
     with pytest.raises(ManifestError, match=f"manifest.json: .*{message}"):
         Manifest.load(synthetic_set)
+
+
+def test_what_is_left_out_is_kept(synthetic_set, tmp_path):
+    manifest = dataclasses.replace(Manifest.load(synthetic_set), left_out={"7": "two doors"})
+    manifest.save(tmp_path)
+    assert Manifest.load(tmp_path) == manifest
+
+
+def test_version_1_did_not_record_what_is_left_out(synthetic_set):
+    manifest = Manifest.load(synthetic_set)
+    edit(synthetic_set, schema_version=1, left_out="remove")
+    assert Manifest.load(synthetic_set) == manifest
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"schema_version": NaN}'])

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from dataset_writers import CABINET, DOOR, HINGE, KNOB, LAPTOP_BASE, LID, LID_HINGE, box, partnet_safe, write_partnet
 
-from render import generate
+from datamodules.manifest import Manifest
+from render import generate, preview
 from render.category import load_category
 from render.sources import open_source
 from render.sources.partnet_mobility import read_semantics
@@ -151,17 +152,25 @@ def test_only_objects_with_exactly_the_categorys_parts_are_instances(tmp_path):
         open_source("partnet-mobility", load_category("oven"), tmp_path, 0).instance_ids()
 
 
-def test_the_generator_says_once_what_is_left_out_and_why(tmp_path, capsys):
-    for name in ("30", "40", "50"):
+def test_generator_and_preview_say_once_what_is_left_out_and_why(tmp_path, capsys):
+    for name in ("30", "40", "50", "60"):
         partnet_safe(tmp_path / "objects" / name)
     for name in ("40", "50"):
         file = tmp_path / "objects" / name / "semantics.txt"
         file.write_text(file.read_text().replace("hinge knob", "hinge door"))
     options = ["--category", "safe", "--source", "partnet-mobility", "--root", str(tmp_path / "objects")]
     size = ["--states", "1", "--rotations", "1", "--points", "32", "--workers", "1"]
+    size += ["--train-instances", "1", "--test-instances", "0"]
     assert generate.main([*options, "--out", str(tmp_path / "out"), *size]) == 0
-    line = "left out 2 object(s), 2 movable part(s) labelled '^door$' instead of 1: 40, 50\n"
-    assert capsys.readouterr().err.count(line) == 1
+    two_doors = "2 movable part(s) labelled '^door$' instead of 1"
+    too_many = "more than --train-instances 1 and --test-instances 0 take"
+    lines = [f"left out 2 object(s), {two_doors}: 40, 50\n", f"left out 1 object(s), {too_many}: 60\n"]
+    said = capsys.readouterr().err
+    assert [said.count(line) for line in lines] == [1, 1]
+    manifest = Manifest.load(tmp_path / "out" / "safe" / "partnet-mobility-complete")
+    assert manifest.left_out == {"40": two_doors, "50": two_doors, "60": too_many}
+    assert preview.main([*options, "--out", str(tmp_path / "preview")]) == 0
+    assert capsys.readouterr().err.count(lines[0]) == 1
 
 
 def test_one_object_folder_is_a_root_too_and_meta_may_be_missing(tmp_path):
