@@ -17,9 +17,8 @@ from torch.nn.functional import one_hot
 
 from articulate_ssl.groups import rotation_group
 from articulate_ssl.inference.checkpoint_file import CHECKPOINT_KEY
-from articulate_ssl.inference.point_cloud_io import farthest_point_order, normalise_cloud
+from articulate_ssl.inference.point_cloud_io import farthest_point_order
 from articulate_ssl.inference.test_report import TestReport
-from articulate_ssl.losses.reconstruction import distances_to_parts
 from articulate_ssl.network.articulated_network import ArticulatedNetwork, Hypotheses
 from articulate_ssl.network.backbone import EquivariantBackbone
 from articulate_ssl.network.rigid_alignment import RigidAlignment
@@ -32,15 +31,14 @@ from articulate_ssl.options import (
     ObjectiveOptions,
     ScheduleOptions,
 )
+from articulate_ssl.pose_estimation import PoseEstimator
 from articulate_ssl.prediction import Prediction
 from articulate_ssl.recipes.objective import PoseTarget, Terms, paper_terms, staged_terms, winning_hypothesis
 from articulate_ssl.recipes.part_discovery import ArticulatedTemplate, dense_template, discover
-from articulate_ssl.registration import JointModel, LabelledTemplate, register_articulated
 from datamodules.articulated_dataset import split_labels
 from datamodules.geometry import PRISMATIC, REVOLUTE, invert_se3, se3, transform_points
 
 JOINT_TYPES = {"revolute": REVOLUTE, "prismatic": PRISMATIC}
-SCALE_STARTS = (-1.5, -0.75, 0.0, 0.75, 1.5)
 
 
 class ArticulatedPoseModule(LightningModule):
@@ -116,6 +114,9 @@ class ArticulatedPoseModule(LightningModule):
             if schedule.rigid_steps
             else None
         )
+        # Without pose awareness a second estimation would repeat the first.
+        iterations = network.iterations if network.pose_aware else 1
+        self.estimator = PoseEstimator(self.articulated, self.rigid, iterations, objective, inference)
         # Of training clouds' mean distance to their centre: how a scan of unknown scale is scaled.
         self.register_buffer("radius_mean", torch.tensor(0.0))
         self.register_buffer("radius_square", torch.tensor(0.0))
@@ -129,156 +130,20 @@ class ArticulatedPoseModule(LightningModule):
             n.group_order, n.dims, n.radii, n.num_neighbors, n.num_kernel_points, n.num_centers, n.intra
         )
 
-    # Pose estimation
+    # Prediction
 
-    def align(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Stage 0: clouds turned roughly to canonical orientation [B, N, 3], and the pose [B, 4, 4] that undoes it."""
-        if self.rigid is None:
-            return points, torch.eye(4).to(points).expand(len(points), 4, 4)
-        with torch.no_grad():
-            hypotheses = self.rigid(points)
-            distance = hypothesis_distances(points, hypotheses.posed(), bidirectional=not self.objective.unidirectional)
-            best = distance.argmin(dim=1)
-            rows = torch.arange(len(points), device=points.device)
-            pose = se3(hypotheses.rotation[rows, best], hypotheses.translation[rows, best])
-        return transform_points(invert_se3(pose), points), pose
-
-    @property
-    def iterations(self) -> int:
-        """Pose estimations per cloud; without pose awareness a second one would repeat the first."""
-        return self.network_options.iterations if self.network_options.pose_aware else 1
-
-    def part_labels(self, hypothesis: Hypotheses, points: Tensor) -> Tensor:
-        """[B, N] part of every point: the posed part of a single hypothesis that lies nearest."""
-        return distances_to_parts(points, hypothesis.posed()[:, 0]).argmin(dim=-1)
-
-    def iterate(self, points: Tensor) -> list[Hypotheses]:
-        """Hypotheses of every iteration for aligned clouds; each starts from the winner of the one before."""
-        results, estimate, labels = [], None, None
-        for _ in range(self.iterations):
-            if results:
-                winner, _ = winning_hypothesis(results[-1], points, self.objective.unidirectional)
-                estimate = results[-1].select(winner)
-                labels = self.part_labels(estimate, points)
-            results.append(self.articulated(points, estimate, labels))
-        return results
-
-    @torch.no_grad()
     def predict_points(self, points: Tensor, refine: bool | None = None) -> Prediction:
-        """Predictions for normalised clouds [B, N, 3]; one cloud's does not depend on the rest of the batch.
-
-        Raises:
-            ValueError: if a cloud has NaN or infinite points.
-        """
-        if not torch.isfinite(points).all():
-            raise ValueError("a cloud has NaN or infinite points")
-        with torch.autocast(points.device.type, enabled=False):
-            return self._predict_points(points, self.inference.refine if refine is None else refine)
-
-    def _predict_points(self, points: Tensor, refine: bool) -> Prediction:
-        aligned, pose = self.align(points)
-        hypotheses = self.iterate(aligned)[-1]
-        distance = hypothesis_distances(
-            aligned, hypotheses.posed().flatten(2, 3), bidirectional=not self.objective.unidirectional
-        )
-        best = hypotheses.select(distance.argmin(dim=1))
-        chosen = self._refine(hypotheses, aligned, distance) if refine else best
-        return self._prediction(chosen.at(pose[:, None] @ chosen.base, chosen.state), points)
-
-    def _refine(self, hypotheses: Hypotheses, points: Tensor, distance: Tensor) -> Hypotheses:
-        """The best of the leading hypotheses after articulated registration of the predicted shape."""
-        options = self.inference
-        leading = distance.topk(min(options.candidates, distance.shape[1]), largest=False).indices
-        candidates = hypotheses.select(leading)
-        count = leading.shape[1]
-        base, state, error = self._register(
-            hypotheses,
-            points.repeat_interleave(count, dim=0),
-            candidates.base.flatten(0, 1),
-            candidates.state.flatten(0, 1),
-            candidates.axis.flatten(0, 1),
-            (options.coarse_scale, options.fine_scale),
-            options.rounds,
-        )
-        best = error.view(-1, count).argmin(dim=1)
-        chosen = candidates.select(best)
-        rows = torch.arange(len(points), device=points.device)
-        return chosen.at(
-            base.view(-1, count, 4, 4)[rows, best][:, None], state.view(len(points), count, -1)[rows, best][:, None]
-        )
-
-    @torch.no_grad()
-    def _register(
-        self,
-        hypotheses: Hypotheses,
-        points: Tensor,  # [B C, N, 3]
-        base: Tensor,  # [B C, 4, 4]
-        state: Tensor,  # [B C, J]
-        axis: Tensor,  # [B C, J, 3]
-        scales: tuple[float, float],
-        rounds: int,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        copies = len(points) // len(hypotheses.part_shape)
-        shape = hypotheses.object_shape().detach()
-        label = torch.arange(self.num_parts, device=points.device).repeat_interleave(shape.shape[2])
-        template = LabelledTemplate(shape.flatten(1, 2).repeat_interleave(copies, dim=0), label, self.num_parts)
-        pivot = hypotheses.pivot.detach().repeat_interleave(copies, dim=0)
-        joints = JointModel(hypotheses.chain, axis.detach(), pivot, hypotheses.joint_type)
-        bidirectional = not self.objective.unidirectional
-        return register_articulated(
-            template, joints, points, base.detach(), state.detach(), scales, rounds, bidirectional
-        )
-
-    def _prediction(self, chosen: Hypotheses, points: Tensor) -> Prediction:
-        """Package one hypothesis per cloud."""
-        pose = chosen.object_pose()[:, 0]
-        part_pose = pose.clone()
-        part_pose[..., :3, 3] = transform_points(pose, chosen.assembly[:, :, None])[:, :, 0]
-        chain = chosen.chain
-        parent = torch.tensor(chain.parent, device=points.device)
-        to_part = distances_to_parts(points, chosen.posed()[:, 0])
-        shape = (len(points), len(parent))
-        axis, pivot = chosen.axis[:, 0], chosen.pivot
-        parent_pose = pose[:, parent]
-        return Prediction(
-            part_id=to_part.argmin(dim=-1),
-            part_probability=(to_part.square() / (-2 * self.objective.posterior_scale**2)).softmax(dim=-1),
-            part_pose=part_pose,
-            part_shape=chosen.part_shape,
-            assembly=chosen.assembly,
-            base_pose=chosen.base[:, 0],
-            joint_parent=parent.expand(shape),
-            joint_child=torch.tensor(chain.child, device=points.device).expand(shape),
-            joint_type=torch.full(shape, chosen.joint_type, device=points.device),
-            joint_axis=(parent_pose[..., :3, :3] @ axis[..., None]).squeeze(-1),
-            joint_pivot=transform_points(parent_pose, pivot[:, :, None])[:, :, 0],
-            joint_state=chosen.state[:, 0],
-            canonical_axis=axis,
-            canonical_pivot=pivot,
-            reconstruction_error=chamfer(
-                points, chosen.posed()[:, 0].flatten(1, 2), bidirectional=not self.objective.unidirectional
-            ),
-        )
+        """Predictions for normalised clouds [B, N, 3]: see `PoseEstimator.predict`."""
+        return self.estimator.predict(points, refine)
 
     def predict_cloud(
         self,
         points: np.ndarray,  # [N, 3] any unit and origin
         refine: bool | None = None,
     ) -> tuple[Prediction, np.ndarray, float, np.ndarray]:
-        """Predict a scan of unknown scale: of several within the training clouds' range, the best reconstruction wins.
-
-        Returns:
-            The prediction (B = 1), centre [3] and scale of the normalisation, and the normalised points it labels.
-        """
-        cloud, center, _ = normalise_cloud(points, self.num_points, scale=1.0)
-        radius = float(np.linalg.norm(np.asarray(points, dtype=np.float64) - center, axis=1).mean())
-        spread = float((self.radius_square - self.radius_mean.square()).clamp(min=0).sqrt())
-        scales = [radius / (float(self.radius_mean) + shift * spread) for shift in SCALE_STARTS]
-        batch = torch.stack([torch.as_tensor(cloud / scale, dtype=torch.float32) for scale in scales]).to(self.device)
-        prediction = self.predict_points(batch, refine)
-        size = batch.norm(dim=-1).mean(dim=-1)
-        best = int((prediction.reconstruction_error / size).argmin())
-        return prediction[best : best + 1], center, scales[best], batch[best].cpu().numpy()
+        """Predict a scan of unknown scale: see `PoseEstimator.predict_scan`."""
+        spread = (self.radius_square - self.radius_mean.square()).clamp(min=0).sqrt()
+        return self.estimator.predict_scan(points, self.num_points, (float(self.radius_mean), float(spread)), refine)
 
     @property
     def state_range(self) -> Tensor:
@@ -359,9 +224,9 @@ class ArticulatedPoseModule(LightningModule):
         return chamfer(points, chosen, bidirectional=not self.objective.unidirectional).mean()
 
     def _paper_step(self, points: Tensor) -> Tensor:
-        aligned, _ = self.align(points)
+        aligned, _ = self.estimator.align(points)
         losses = []
-        for hypotheses in self.iterate(aligned):
+        for hypotheses, _ in self.estimator.iterate(aligned):
             winner, _ = winning_hypothesis(hypotheses, aligned, self.objective.unidirectional)
             selected = hypotheses.select(winner)
             terms = paper_terms(selected, aligned, self.objective)
@@ -379,37 +244,32 @@ class ArticulatedPoseModule(LightningModule):
         )
         turn = se3(rotation, torch.zeros(size, 3)).to(device)
         points, base, state = (self.registered[name][index].to(device) for name in ("points", "base", "state"))
-        aligned, pose = self.align(transform_points(turn, points))
+        aligned, pose = self.estimator.align(transform_points(turn, points))
         base = invert_se3(pose) @ turn @ base
-        losses, estimate, labels = [], None, None
+        losses = []
         target = PoseTarget(base, state)
         category = self.articulated.category_object()
-        for iteration in range(self.iterations):
-            hypotheses = self.articulated(aligned, estimate, labels)
+        for hypotheses, estimate in self.estimator.iterate(aligned):
             start = torch.eye(3, device=device) if estimate is None else estimate.base[:, 0, :3, :3]
             nearest = self.group.nearest(start.transpose(-1, -2) @ base[:, :3, :3])
             selected = hypotheses.select(nearest)
             terms = staged_terms(selected, aligned, category, self.objective, target, follow_category=True)
             losses.append(terms.loss)
-            if iteration + 1 < self.iterations:
-                winner, _ = winning_hypothesis(hypotheses, aligned, self.objective.unidirectional)
-                estimate = hypotheses.select(winner)
-                labels = self.part_labels(estimate, aligned)
         self._track(terms, selected)
         return torch.stack(losses).mean()
 
     def _staged_step(self, points: Tensor) -> Tensor:
         """Any training cloud: the best reconstruction trains, drawn to where a few rounds of registration move it."""
-        aligned, _ = self.align(points)
+        aligned, _ = self.estimator.align(points)
         category = self.articulated.category_object()
         losses = []
-        for hypotheses in self.iterate(aligned):
+        for hypotheses, _ in self.estimator.iterate(aligned):
             winner, before = winning_hypothesis(hypotheses, aligned, self.objective.unidirectional)
             selected = hypotheses.select(winner)
             target = None
             if self.objective.distillation:
                 start = selected.base[:, 0], selected.state[:, 0], selected.axis[:, 0]
-                base, state, after = self._register(selected, aligned, *start, (0.04, 0.02), 4)
+                base, state, after = self.estimator.register(selected, aligned, *start, (0.04, 0.02), 4)
                 better = after < before
                 target = PoseTarget(
                     torch.where(better[:, None, None], base, start[0].detach()),

@@ -1,0 +1,205 @@
+"""From clouds to articulated poses: aligned, hypothesised over the group, iterated, chosen, and registered.
+
+1. *Alignment* (stage 0): the rigid network turns the whole cloud to roughly canonical orientation.
+2. *Iteration*: the articulated network gives a hypothesis per group element; from the second pass on it reads the
+   cloud in the part frames of the last winner (paper, Sec. 3.1).
+3. *Registration* at test time: the leading hypotheses' predicted shapes are registered to the cloud without leaving
+   their joints, and the best reconstruction wins.
+
+Training takes the first two steps too; nothing here knows a loss or an optimiser.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from articulate_ssl.inference.point_cloud_io import normalise_cloud
+from articulate_ssl.losses.reconstruction import distances_to_parts
+from articulate_ssl.network.articulated_network import ArticulatedNetwork, Hypotheses
+from articulate_ssl.network.rigid_alignment import RigidAlignment
+from articulate_ssl.ops.chamfer import chamfer, hypothesis_distances
+from articulate_ssl.options import InferenceOptions, ObjectiveOptions
+from articulate_ssl.prediction import Prediction
+from articulate_ssl.recipes.objective import winning_hypothesis
+from articulate_ssl.registration import JointModel, LabelledTemplate, register_articulated
+from datamodules.geometry import invert_se3, se3, transform_points
+
+SCALE_STARTS = (-1.5, -0.75, 0.0, 0.75, 1.5)
+
+
+class PoseEstimator:
+    """Pose estimation with the networks of a module, which owns them, trains them and saves them.
+
+    Args:
+        articulated: The articulated network.
+        rigid: Stage 0's network, or None where clouds are taken as they come.
+        iterations: Pose estimations per cloud.
+        objective: Whose reconstruction distance chooses among hypotheses.
+        inference: Registration at test time.
+    """
+
+    def __init__(
+        self,
+        articulated: ArticulatedNetwork,
+        rigid: RigidAlignment | None,
+        iterations: int,
+        objective: ObjectiveOptions,
+        inference: InferenceOptions,
+    ) -> None:
+        self.articulated, self.rigid, self.iterations = articulated, rigid, iterations
+        self.unidirectional, self.posterior_scale = objective.unidirectional, objective.posterior_scale
+        self.inference = inference
+
+    def align(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Stage 0: clouds turned roughly to canonical orientation [B, N, 3], and the pose [B, 4, 4] that undoes it."""
+        if self.rigid is None:
+            return points, torch.eye(4).to(points).expand(len(points), 4, 4)
+        with torch.no_grad():
+            hypotheses = self.rigid(points)
+            distance = hypothesis_distances(points, hypotheses.posed(), bidirectional=not self.unidirectional)
+            best = distance.argmin(dim=1)
+            rows = torch.arange(len(points), device=points.device)
+            pose = se3(hypotheses.rotation[rows, best], hypotheses.translation[rows, best])
+        return transform_points(invert_se3(pose), points), pose
+
+    def iterate(
+        self,
+        points: Tensor,  # [B, N, 3] aligned
+    ) -> Iterator[tuple[Hypotheses, Hypotheses | None]]:
+        """Hypotheses of every iteration, and the estimate each started from: the winner of the one before, or None."""
+        estimate, labels = None, None
+        for iteration in range(self.iterations):
+            hypotheses = self.articulated(points, estimate, labels)
+            yield hypotheses, estimate
+            if iteration + 1 < self.iterations:
+                winner, _ = winning_hypothesis(hypotheses, points, self.unidirectional)
+                estimate = hypotheses.select(winner)
+                labels = distances_to_parts(points, estimate.posed()[:, 0]).argmin(dim=-1)
+
+    @torch.no_grad()
+    def register(
+        self,
+        hypotheses: Hypotheses,  # whose shapes and pivots are registered; C copies of each cloud
+        points: Tensor,  # [B C, N, 3]
+        base: Tensor,  # [B C, 4, 4] start
+        state: Tensor,  # [B C, J] start
+        axis: Tensor,  # [B C, J, 3]
+        scales: tuple[float, float],
+        rounds: int,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Register the predicted shapes to the clouds: see `register_articulated`, whose result this is."""
+        copies = len(points) // len(hypotheses.part_shape)
+        shape = hypotheses.object_shape()
+        num_parts, shape_points = shape.shape[1:3]
+        label = torch.arange(num_parts, device=points.device).repeat_interleave(shape_points)
+        template = LabelledTemplate(shape.flatten(1, 2).repeat_interleave(copies, dim=0), label, num_parts)
+        pivot = hypotheses.pivot.repeat_interleave(copies, dim=0)
+        joints = JointModel(hypotheses.chain, axis, pivot, hypotheses.joint_type)
+        return register_articulated(template, joints, points, base, state, scales, rounds, not self.unidirectional)
+
+    @torch.no_grad()
+    def predict(self, points: Tensor, refine: bool | None = None) -> Prediction:
+        """Predictions for normalised clouds [B, N, 3]; one cloud's does not depend on the rest of the batch.
+
+        Args:
+            refine: Register at test time, or not; None does what the options say.
+
+        Raises:
+            ValueError: if a cloud has NaN or infinite points.
+        """
+        if not torch.isfinite(points).all():
+            raise ValueError("a cloud has NaN or infinite points")
+        with torch.autocast(points.device.type, enabled=False):
+            aligned, pose = self.align(points)
+            *_, (hypotheses, _) = self.iterate(aligned)
+            posed = hypotheses.posed().flatten(2, 3)
+            distance = hypothesis_distances(aligned, posed, bidirectional=not self.unidirectional)
+            if self.inference.refine if refine is None else refine:
+                chosen = self._refine(hypotheses, aligned, distance)
+            else:
+                chosen = hypotheses.select(distance.argmin(dim=1))
+            return self._prediction(chosen.at(pose[:, None] @ chosen.base, chosen.state), points)
+
+    def predict_scan(
+        self,
+        points: np.ndarray,  # [N, 3] any unit and origin
+        num_points: int,
+        radius: tuple[float, float],
+        refine: bool | None = None,
+    ) -> tuple[Prediction, np.ndarray, float, np.ndarray]:
+        """Predict a scan of unknown scale: of several within the training clouds' range, the best reconstruction wins.
+
+        Args:
+            num_points: That the networks read.
+            radius: Mean and standard deviation, over normalised training clouds, of the points' mean distance to their
+                centre.
+
+        Returns:
+            The prediction (B = 1), centre [3] and scale of the normalisation, and the normalised points it labels.
+        """
+        cloud, center, _ = normalise_cloud(points, num_points, scale=1.0)
+        mean, spread = radius
+        size = float(np.linalg.norm(np.asarray(points, dtype=np.float64) - center, axis=1).mean())
+        scales = [size / (mean + shift * spread) for shift in SCALE_STARTS]
+        device = self.articulated.template.device
+        batch = torch.stack([torch.as_tensor(cloud / scale, dtype=torch.float32) for scale in scales]).to(device)
+        prediction = self.predict(batch, refine)
+        extent = batch.norm(dim=-1).mean(dim=-1)
+        best = int((prediction.reconstruction_error / extent).argmin())
+        return prediction[best : best + 1], center, scales[best], batch[best].cpu().numpy()
+
+    def _refine(self, hypotheses: Hypotheses, points: Tensor, distance: Tensor) -> Hypotheses:
+        """The best of the leading hypotheses after articulated registration of the predicted shape."""
+        options = self.inference
+        leading = distance.topk(min(options.candidates, distance.shape[1]), largest=False).indices
+        candidates = hypotheses.select(leading)
+        count = leading.shape[1]
+        base, state, error = self.register(
+            hypotheses,
+            points.repeat_interleave(count, dim=0),
+            candidates.base.flatten(0, 1),
+            candidates.state.flatten(0, 1),
+            candidates.axis.flatten(0, 1),
+            (options.coarse_scale, options.fine_scale),
+            options.rounds,
+        )
+        best = error.view(-1, count).argmin(dim=1)
+        chosen = candidates.select(best)
+        rows = torch.arange(len(points), device=points.device)
+        return chosen.at(
+            base.view(-1, count, 4, 4)[rows, best][:, None], state.view(len(points), count, -1)[rows, best][:, None]
+        )
+
+    def _prediction(self, chosen: Hypotheses, points: Tensor) -> Prediction:
+        """Package one hypothesis per cloud."""
+        pose = chosen.object_pose()[:, 0]
+        part_pose = pose.clone()
+        part_pose[..., :3, 3] = transform_points(pose, chosen.assembly[:, :, None])[:, :, 0]
+        chain = chosen.chain
+        parent = torch.tensor(chain.parent, device=points.device)
+        posed = chosen.posed()[:, 0]
+        to_part = distances_to_parts(points, posed)
+        shape = (len(points), len(parent))
+        axis, pivot = chosen.axis[:, 0], chosen.pivot
+        parent_pose = pose[:, parent]
+        return Prediction(
+            part_id=to_part.argmin(dim=-1),
+            part_probability=(to_part.square() / (-2 * self.posterior_scale**2)).softmax(dim=-1),
+            part_pose=part_pose,
+            part_shape=chosen.part_shape,
+            assembly=chosen.assembly,
+            base_pose=chosen.base[:, 0],
+            joint_parent=parent.expand(shape),
+            joint_child=torch.tensor(chain.child, device=points.device).expand(shape),
+            joint_type=torch.full(shape, chosen.joint_type, device=points.device),
+            joint_axis=(parent_pose[..., :3, :3] @ axis[..., None]).squeeze(-1),
+            joint_pivot=transform_points(parent_pose, pivot[:, :, None])[:, :, 0],
+            joint_state=chosen.state[:, 0],
+            canonical_axis=axis,
+            canonical_pivot=pivot,
+            reconstruction_error=chamfer(points, posed.flatten(1, 2), bidirectional=not self.unidirectional),
+        )
