@@ -21,8 +21,8 @@ bin := .venv/bin
 packages := .venv/.packages
 cluster := .venv/.cluster
 
-# Only `make setup` compiles torch-scatter and torch-cluster unless told not to (CLUSTER=0); the other targets take 4
-# minutes less on a fresh machine and need neither, so they compile them only when told to (CLUSTER=1).
+# Only `make setup` compiles torch-scatter and torch-cluster unless told not to (CLUSTER=0); the other targets take
+# about 6 minutes less on a fresh machine and need neither, so they compile them only when told to (CLUSTER=1).
 demo_options := -c configs/laptop.yaml -c configs/profiles/cpu.yaml -c configs/profiles/smoke.yaml \
   --data.root build/demo/data --trainer.default_root_dir build/demo/run
 # One cloud of the real laptop, half open, in the metres of its model.
@@ -41,7 +41,7 @@ help: ## List these targets.
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-9s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 	@echo 'Options go behind the target, as in: make data CAT=laptop VIEW=partial'
 
-setup: $(packages) $(if $(filter 0,$(CLUSTER)),,$(cluster)) ## Make .venv; compile torch-scatter and torch-cluster (4 min, once) unless CLUSTER=0. [PYTHON=python3]
+setup: $(packages) $(if $(filter 0,$(CLUSTER)),,$(cluster)) ## Make .venv; compile torch-scatter and torch-cluster (about 6 minutes, once) unless CLUSTER=0. [PYTHON=python3]
 
 $(packages): pyproject.toml .ci/setup
 	@PYTHON='$(PYTHON)' .ci/setup packages
