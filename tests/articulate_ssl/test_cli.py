@@ -67,11 +67,12 @@ def test_a_missing_or_truncated_checkpoint_is_refused(run, workplace):
     _refused(run("test", "-c", "laptop.yaml", "--ckpt_path", "cut.ckpt"), "cut.ckpt", "damaged")
 
 
-def test_a_checkpoint_of_another_category_is_refused(run, workplace):
+@pytest.mark.parametrize("command", ["test", "validate"])
+def test_a_checkpoint_of_another_category_is_refused(run, workplace, command):
     content = torch.load(workplace / "trained.ckpt", weights_only=True)
     content["hyper_parameters"]["category"] = "oven"
     torch.save(content, workplace / "oven.ckpt")
-    _refused(run("test", "-c", "laptop.yaml", "--ckpt_path", "oven.ckpt"), "oven.ckpt", "'oven'", "'laptop'")
+    _refused(run(command, "-c", "laptop.yaml", "--ckpt_path", "oven.ckpt"), "oven.ckpt", "'oven'", "'laptop'")
 
 
 @pytest.mark.parametrize("key", ["--model.network.group_ordr=12", "--model.recpie=paper", "--data.batchsize=3"])
@@ -95,6 +96,17 @@ def test_missing_data_are_refused_with_the_command_that_makes_them(run, tmp_path
 
 def test_a_missing_cloud_is_refused(run):
     _refused(run("predict", "nowhere.ply", "--ckpt", "trained.ckpt"), "nowhere.ply")
+
+
+@pytest.mark.parametrize(
+    ("points", "problem"),
+    [(np.full((500, 3), np.nan), "NaN"), (np.empty((0, 3)), "no points"), (np.ones((1, 3)), "one point")],
+    ids=["NaN", "empty", "one point"],
+)
+def test_an_unusable_cloud_is_refused(run, workplace, points, problem):
+    np.save(workplace / "bad.npy", points)
+    _refused(run("predict", "bad.npy", "--ckpt", "trained.ckpt"), "bad.npy", problem)
+    assert not (workplace / "bad-prediction").exists()
 
 
 def test_a_test_writes_its_metrics(run, workplace):

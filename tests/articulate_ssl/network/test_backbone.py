@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from articulate_ssl.equivariance import Permutation, Vector, assert_equivariant, off_group_residual
+from articulate_ssl.equivariance import TOLERANCE, Permutation, Vector, assert_equivariant, off_group_residual
 from articulate_ssl.network.backbone import EquivariantBackbone
 
 
@@ -24,17 +24,27 @@ def test_rotations_of_the_cloud_permute_the_group(group_order, intra, dtype):
         assert_equivariant(backbone, (points,), backbone.group, [Vector()], Permutation())
 
 
-def test_translation_changes_nothing():
-    backbone = _backbone().double()
-    points = 0.5 * torch.rand(2, 40, 3, dtype=torch.float64)
-    torch.testing.assert_close(backbone(points + 5), backbone(points), rtol=1e-9, atol=1e-9)
+def _error(value, expected) -> float:
+    return ((value - expected).norm() / expected.norm()).item()
 
 
-def test_the_order_of_points_does_not_matter():
-    backbone = _backbone().double()
-    points = 0.5 * torch.rand(2, 40, 3, dtype=torch.float64)
+def _with_places(backbone, points):
+    """A broken layer: it reads where a point is, and in which place of the cloud."""
+    return backbone(points) + points.mean(dim=-1)[..., None, None] * torch.linspace(0, 1, 40)[:, None, None]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_translation_and_the_order_of_points_do_not_matter(dtype):
+    backbone = _backbone().to(dtype)
+    points = 0.5 * torch.rand(2, 40, 3, dtype=dtype)
     order = torch.randperm(40)
-    torch.testing.assert_close(backbone(points[:, order]), backbone(points)[:, order])
+    with torch.no_grad():
+        expected = backbone(points)
+        assert _error(backbone(points + 5), expected) < TOLERANCE[dtype]
+        assert _error(backbone(points[:, order]), expected[:, order]) < TOLERANCE[dtype]
+        expected = _with_places(backbone, points)
+        assert _error(_with_places(backbone, points + 5), expected) > 1e-2
+        assert _error(_with_places(backbone, points[:, order]), expected[:, order]) > 1e-2
 
 
 @pytest.mark.parametrize("training", [True, False])

@@ -4,7 +4,7 @@ import pytest
 import roma
 import torch
 
-from articulate_ssl.equivariance import assert_part_equivariant
+from articulate_ssl.equivariance import Permutation, assert_part_equivariant
 from articulate_ssl.groups import rotation_group
 from articulate_ssl.network.backbone import EquivariantBackbone
 from articulate_ssl.network.pose_aware_convolution import (
@@ -64,6 +64,46 @@ def test_camera_and_canonical_frames_are_inverse():
 def test_canonicalize_undoes_the_poses():
     points, poses, _, canonical = _articulated_cloud(roma.random_rotmat(2, dtype=torch.float64))
     torch.testing.assert_close(canonicalize(points, poses), canonical)
+
+
+@pytest.mark.parametrize("order", [12, 60])
+def test_a_part_that_moves_turns_its_own_features_and_no_others(order):
+    torch.manual_seed(0)
+    group = rotation_group(order)
+    kernel = symmetric_kernel_points(group)
+    rotation, middle = group.elements[torch.randint(order, (2,))], torch.full((3, 1), 0.2, dtype=torch.float64)
+    part_id = torch.arange(48)[None] % 2
+    poses = se3(rotation, (middle - rotation @ middle).squeeze(-1))[part_id]  # parts interpenetrate, and stay so
+    canonical = 0.4 * torch.rand(1, 48, 3, dtype=torch.float64)
+    points = transform_points(poses, canonical[..., None, :]).squeeze(-2)
+    features = torch.randn(1, 48, order, 3, dtype=torch.float64)
+    weight = torch.randn(24, 3, 4, dtype=torch.float64)
+    element = 5
+    motion = se3(group.elements[element], torch.randn(3, dtype=torch.float64))
+    mine = part_id[0] == 1
+
+    def move(points, poses, features):
+        points, poses, features = points.clone(), poses.clone(), features.clone()
+        points[:, mine] = transform_points(motion, points[:, mine])
+        poses[:, mine] = motion @ poses[:, mine]
+        features[:, mine] = Permutation()(features[:, mine], group, element)
+        return points, poses, features
+
+    def error(layer) -> float:
+        before = layer(features, points, poses)
+        moved_points, moved_poses, moved_features = move(points, poses, features)
+        after = layer(moved_features, moved_points, moved_poses)
+        _, _, expected = move(points, poses, before)
+        return ((after - expected).norm() / expected.norm()).item()
+
+    def pose_aware(features, points, poses):
+        return pose_aware_convolution(features, points, poses, weight, group, kernel, 0.25, 12)
+
+    def blind(features, points, poses):
+        return pose_aware(features, points, torch.eye(4, dtype=torch.float64).expand_as(poses))
+
+    assert error(pose_aware) < 1e-9
+    assert error(blind) > 1e-2
 
 
 @pytest.fixture

@@ -35,6 +35,17 @@ def test_identical_points_and_a_single_point_are_free_of_nan():
     assert all(p.grad.isfinite().all() for p in attention.parameters())
 
 
+def test_a_slot_that_no_point_chooses_is_free_of_nan():
+    attention, features = _proposal()
+    with torch.no_grad():
+        attention.to_query.weight.mul_(1e5)  # competition becomes a hard choice
+    logits = attention(features[:, :1].expand(-1, 9, -1))
+    assert (logits.softmax(dim=-1).sum(dim=1) == 0).any()
+    logits.softmax(dim=-1)[..., 0].sum().backward()
+    assert logits.isfinite().all()
+    assert all(p.grad.isfinite().all() for p in attention.parameters())
+
+
 def test_every_parameter_gets_a_gradient():
     attention, features = _proposal()
     attention(features).square().sum().backward()
