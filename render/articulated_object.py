@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -70,6 +71,11 @@ class ArticulatedObject:
         lower = np.min([m.bounds[0] for m in self.meshes], axis=0)
         upper = np.max([m.bounds[1] for m in self.meshes], axis=0)
         return float(np.linalg.norm(upper - lower))
+
+    @cached_property
+    def part_centers(self) -> np.ndarray:  # [K, 3]
+        """Bounding-box centre of every part at rest, object frame."""
+        return np.array([mesh.bounds.mean(0) for mesh in self.meshes])
 
     def part_motion(
         self,

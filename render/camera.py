@@ -66,8 +66,10 @@ def look_at_rotation(azimuth: float, elevation: float, roll: float) -> np.ndarra
         Azimuth 0 looks at the front, growing azimuth moves the camera to the side of +x; growing elevation moves it up;
         growing roll turns the camera clockwise as seen from behind it.
     """
-    forward = -np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
-    right = np.array([np.cos(azimuth), 0.0, -np.sin(azimuth)])
-    down = np.cross(forward, right)
+    sine_a, cosine_a = np.sin(azimuth), np.cos(azimuth)
+    sine_e, cosine_e = np.sin(elevation), np.cos(elevation)
+    forward = -np.array([sine_a * cosine_e, sine_e, cosine_a * cosine_e])
+    right = np.array([cosine_a, 0.0, -sine_a])
+    down = np.array([sine_a * sine_e, -cosine_e, cosine_a * sine_e])
     sine, cosine = np.sin(roll), np.cos(roll)
     return np.stack([cosine * right + sine * down, cosine * down - sine * right, forward])

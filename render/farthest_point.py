@@ -38,10 +38,11 @@ def farthest_point_order(
     height = min(_TREE_HEIGHT, len(points).bit_length() - 1)
     # Without a start index fpsample draws one from numpy's global generator.
     order = fpsample.bucket_fps_kdline_sampling(points.astype(np.float32), num_points, h=height, start_idx=0)
-    # When only copies of chosen points are left it repeats itself: those copies follow in their own order instead.
-    unique = order[np.sort(np.unique(order, return_index=True)[1])].astype(np.int64)
-    if len(unique) == num_points:
-        return unique
+    order = order.astype(np.int64)
     left = np.ones(len(points), dtype=bool)
-    left[unique] = False
+    left[order] = False
+    if left.sum() == len(points) - num_points:
+        return order
+    # When only copies of chosen points are left it repeats itself: those copies follow in their own order instead.
+    unique = order[np.sort(np.unique(order, return_index=True)[1])]
     return np.concatenate([unique, np.flatnonzero(left)])[:num_points]

@@ -59,7 +59,7 @@ def pose_labels(
         "joint_axis": np.einsum("jab,jb->ja", pose[parent, :3, :3], axis),
         "joint_pivot": np.einsum("jab,jb->ja", pose[parent, :3, :3], pivot) + pose[parent, :3, 3],
         "joint_state": np.where(prismatic, states / scale, states),
-        "part_center": np.array([mesh.bounds.mean(0) for mesh in instance.meshes]) / scale,
+        "part_center": instance.part_centers / scale,
         "object_rotation": rotation,
         "center": center,
         "scale": np.float64(scale),

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy.ndimage import laplace
 
 from render.articulated_object import ArticulatedObject
 from render.camera import look_at_rotation
-from render.depth_renderer import offscreen_renderer
+from render.depth_renderer import offscreen_context
 
 # Base in grey, moving parts in the colour-blind safe palette of Okabe and Ito.
 PART_COLORS = np.array(
@@ -79,7 +80,7 @@ def shaded_picture(
     Raises:
         RendererUnavailable: if there is no working EGL.
     """
-    renderer = offscreen_renderer()
+    renderer = _renderer()
     import pyrender
 
     scene = pyrender.Scene(bg_color=(1.0, 1.0, 1.0, 1.0), ambient_light=(0.3, 0.3, 0.3))
@@ -96,6 +97,15 @@ def shaded_picture(
     renderer.viewport_width = renderer.viewport_height = resolution
     color, depth = renderer.render(scene)
     return (color * (1.0 - 0.75 * _creases(depth, distance)[..., None])).astype(np.uint8)
+
+
+@cache
+def _renderer():
+    """The process's one `pyrender.OffscreenRenderer`."""
+    offscreen_context()  # fails with a clear message where pyrender would not
+    import pyrender
+
+    return pyrender.OffscreenRenderer(64, 64)
 
 
 def _opengl_pose(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:  # [4, 4]

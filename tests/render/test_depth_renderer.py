@@ -7,9 +7,10 @@ import pytest
 import trimesh
 from objects import box
 
+from render import depth_renderer
 from render.camera import BACKGROUND, Camera, sample_view
 from render.category import load_category
-from render.depth_renderer import DepthRenderer
+from render.depth_renderer import DepthRenderer, RendererUnavailable
 from render.posing import compose, sample_states
 from render.ray_caster import RayCaster
 from render.sources import open_source
@@ -58,6 +59,23 @@ def test_bodies_that_are_inside_out_are_seen_from_outside():
     depth, _ = DepthRenderer([mesh]).render(poses, Camera(64))
     expected, _ = RayCaster([mesh]).render(poses, Camera(64))
     np.testing.assert_allclose(depth, expected, atol=1e-5)
+
+
+def test_one_renderer_leaves_the_other_alone():
+    """All share one context: another image size, or another object's end, changes nothing."""
+    first, second = DepthRenderer([box([-0.5, -0.5, 0], [0.5, 0.5, 1])]), DepthRenderer([box([-9, -9, 0], [9, 9, 1])])
+    pose = np.array([at_depth(2.0)])
+    expected = first.render(pose, Camera(40))
+    assert second.render(pose, Camera(24))[0].shape == (24, 24)
+    del second
+    for image, wanted in zip(first.render(pose, Camera(40)), expected, strict=True):
+        np.testing.assert_array_equal(image, wanted)
+
+
+def test_a_device_that_is_missing_is_a_clear_error(monkeypatch):
+    monkeypatch.setenv("EGL_DEVICE_ID", "99")
+    with pytest.raises(RendererUnavailable, match=r"no offscreen OpenGL .*Invalid device ID \(99"):
+        depth_renderer.offscreen_context.__wrapped__()
 
 
 def test_camera_inside_the_object_is_refused():
