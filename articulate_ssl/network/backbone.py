@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import leaky_relu
 
 from articulate_ssl.groups import RotationGroup, rotation_group
 from articulate_ssl.network.pose_aware_convolution import canonicalize
 from articulate_ssl.ops.group_convolution import group_convolution
 from articulate_ssl.ops.kernel_points import KernelPoints, symmetric_kernel_points
-from articulate_ssl.ops.neighborhood import Neighborhood, correlate, nearest_neighbors
+from articulate_ssl.ops.neighborhood import Neighborhood, Neighbors, correlate, nearest_neighbors
+from articulate_ssl.ops.normalization import layer_norm_leaky_relu
 
 
 class IntraGroupConvolution(nn.Module):
@@ -68,7 +68,7 @@ class GroupConvolutionBlock(nn.Module):
         neighborhood: Neighborhood,  # its M centres are the leading points
     ) -> Tensor:  # [B, M, G, C']
         out = group_convolution(features, neighborhood, self.weight, self.permutation)
-        out = leaky_relu(self.norm(out), negative_slope=0.01, inplace=True)
+        out = layer_norm_leaky_relu(out, self.norm.weight, self.norm.bias, 0.01, self.norm.eps)
         if self.intra is None:
             return out
         B, M, G, _ = out.shape
@@ -126,16 +126,17 @@ class EquivariantBackbone(nn.Module):
         self,
         points: Tensor,  # [B, N, 3]
     ) -> list[Neighborhood]:
-        """The geometry of every layer; layers with the same input and output points share one neighbour search."""
+        """The geometry of every layer; layers that see the same points share one neighbour search."""
         B, N = points.shape[:2]
-        found = {}
+        found: dict[int, Neighbors] = {}
         neighborhoods = []
         for layer, radius in enumerate(self.radii):
             M = N if self.num_centers is None else min(N, self.num_centers[layer])
-            if (N, M) not in found:
+            if N not in found:
+                # Centres only get fewer: the search of the first layer that sees these points serves the later ones.
                 centers = None if M == N else torch.arange(M, device=points.device).expand(B, M)
-                found[N, M] = nearest_neighbors(points[:, :N], self.num_neighbors, centers)
-            neighborhoods.append(correlate(found[N, M], radius, self.kernel_points))
+                found[N] = nearest_neighbors(points[:, :N], self.num_neighbors, centers)
+            neighborhoods.append(correlate(found[N].leading(M), radius, self.kernel_points))
             N = M
         return neighborhoods
 

@@ -24,6 +24,10 @@ class Neighbors(NamedTuple):
     offset: Tensor
     num_points: int
 
+    def leading(self, num_centers: int) -> Neighbors:
+        """Neighbours of the first centres only."""
+        return self._replace(index=self.index[:, :num_centers], offset=self.offset[:, :, :num_centers])
+
 
 class Neighborhood(NamedTuple):
     """Neighbours and their correlation with every kernel point.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.nn.functional import layer_norm, leaky_relu
 
 from articulate_ssl.groups import RotationGroup
 from articulate_ssl.ops.kernel_points import KernelPoints
@@ -82,3 +83,14 @@ def pose_aware_convolution(
     grouped = features[sample[..., None], index[..., None], match]  # [B, N, n, G, C]
     aggregate = torch.einsum("bmngk,bmngc->bmgkc", correlation, grouped)
     return torch.einsum("bmgkc,kcd->bmgd", aggregate, weight)
+
+
+def layer_norm_leaky_relu(
+    features: Tensor,  # [..., C]
+    weight: Tensor,  # [C]
+    bias: Tensor,  # [C]
+    slope: float,
+    eps: float = 1e-5,
+) -> Tensor:  # [..., C]
+    """LeakyReLU(LayerNorm(features)) in plain autograd."""
+    return leaky_relu(layer_norm(features, weight.shape, weight, bias, eps), slope)

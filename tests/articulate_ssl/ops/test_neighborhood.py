@@ -69,3 +69,11 @@ def test_wrong_shapes_are_refused(shape):
 def test_wrong_centers_are_refused():
     with pytest.raises(ValueError, match="centers must be"):
         build_neighborhood(torch.zeros(2, 5, 3), 0.1, KERNEL, 4, torch.arange(3))
+
+
+def test_the_leading_centres_of_a_search_are_a_search_of_the_leading_centres():
+    points = torch.rand(2, 30, 3, generator=torch.Generator().manual_seed(0))
+    some = nearest_neighbors(points, 8, torch.arange(10).expand(2, -1))
+    leading = nearest_neighbors(points, 8).leading(10)
+    torch.testing.assert_close(leading.index.sort().values, some.index.sort().values)
+    torch.testing.assert_close(leading.offset.sum(dim=-1), some.offset.sum(dim=-1))
