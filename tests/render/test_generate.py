@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import io
 import json
 import multiprocessing
 import os
@@ -23,7 +24,7 @@ from dask.distributed import LocalCluster
 from datamodules import atomic
 from datamodules.geometry import screw_motion, transform_points
 from datamodules.manifest import Manifest, set_folder
-from datamodules.shards import read_shard
+from datamodules.shards import read_shard, write_shard
 from datamodules.verify import verify_set
 from render.category import load_category
 from render.execution import run_tasks
@@ -44,6 +45,29 @@ def make(out: Path, *options: str, train: int = 2, test: int = 1, category: str 
 def contents(folder: Path) -> dict[str, bytes]:
     """Every file of a set."""
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def assert_same(found: dict[str, bytes], expected: dict[str, bytes]) -> None:
+    """Fails with the first differing array and index of every file."""
+    assert sorted(found) == sorted(expected)
+    differences = [difference(name, found[name], expected[name]) for name in found if found[name] != expected[name]]
+    assert not differences, "\n".join(differences)
+
+
+def difference(name: str, found: bytes, expected: bytes) -> str:
+    """Where two versions of a file differ, in words."""
+    if name.endswith(".npz"):
+        pair = [np.load(io.BytesIO(content)) for content in (found, expected)]
+        for array in pair[1]:
+            a, b = (content[array] for content in pair)
+            if a.shape != b.shape:
+                return f"{name}: {array} has shape {a.shape}, expected {b.shape}"
+            if (different := np.argwhere(a != b)).size:
+                index = tuple(different[0].tolist())
+                return f"{name}: {array}[{index}] is {a[index]!r}, expected {b[index]!r}; {len(different)} differ"
+    position = next((i for i, (a, b) in enumerate(zip(found, expected, strict=False)) if a != b), len(expected))
+    around = slice(max(0, position - 40), position + 40)
+    return f"{name}: byte {position}: {found[around]!r}, expected {expected[around]!r}"
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +132,7 @@ def test_moving_a_part_about_its_joint_lands_on_the_cloud_of_another_state(compl
 @pytest.mark.parametrize(("workers", "options"), [("2", ["--view", "partial"]), ("3", [])])
 def test_bytes_do_not_depend_on_the_number_of_workers(tmp_path, workers, options):
     expected = contents(make(tmp_path / "1", *options))
-    assert contents(make(tmp_path / workers, *options, "--workers", workers)) == expected
+    assert_same(contents(make(tmp_path / workers, *options, "--workers", workers)), expected)
 
 
 def test_another_seed_gives_other_bytes(tmp_path, complete_set):
@@ -121,7 +145,19 @@ def test_another_seed_gives_other_bytes(tmp_path, complete_set):
 def test_dask_makes_the_same_bytes(tmp_path, complete_set):
     with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, processes=False) as cluster:
         folder = make(tmp_path, "--scheduler", cluster.scheduler_address)
-    assert contents(folder) == contents(complete_set)
+    assert_same(contents(folder), contents(complete_set))
+
+
+def test_a_difference_is_named_by_array_and_index(tmp_path, complete_set):
+    expected = contents(complete_set)
+    name = "train/shard-00000.npz"
+    arrays = {key: array.copy() for key, array in read_shard(complete_set / name).items()}
+    arrays["points"][1, 2, 0] = 5
+    write_shard(tmp_path / "shard.npz", arrays)
+    with pytest.raises(AssertionError, match=rf"{name}: points\[\(1, 2, 0\)\] is .*5.*; 1 differ"):
+        assert_same(expected | {name: (tmp_path / "shard.npz").read_bytes()}, expected)
+    with pytest.raises(AssertionError, match=r"manifest.json: byte 0: b'x"):
+        assert_same(expected | {"manifest.json": b"x"}, expected)
 
 
 def test_unreachable_scheduler_is_a_clear_error(tmp_path, capsys):
@@ -191,7 +227,7 @@ def test_an_unfinished_set_keeps_what_is_done(tmp_path, complete_set, monkeypatc
     (folder / "test" / "shard-00000.npz").unlink()
     untouched = (folder / "train" / "shard-00000.npz").stat().st_mtime_ns
     make(tmp_path)
-    assert contents(folder) == contents(complete_set)
+    assert_same(contents(folder), contents(complete_set))
     assert (folder / "train" / "shard-00000.npz").stat().st_mtime_ns == untouched
 
 
@@ -204,7 +240,7 @@ def test_a_torn_journal_line_is_made_again(tmp_path, complete_set):
     (folder / ".journal.jsonl").write_text(json.dumps(header) + '\n{"split": "train", "na')
     (folder / "train" / ".shard-00000.npz.0123.tmp").write_bytes(b"left by a killed run")
     make(tmp_path)
-    assert contents(folder) == contents(complete_set)
+    assert_same(contents(folder), contents(complete_set))
 
 
 def test_other_options_in_the_same_folder_are_refused(tmp_path, complete_set, capsys):
@@ -265,7 +301,7 @@ def test_full_disk_keeps_what_is_done_and_can_be_continued(tmp_path, complete_se
     assert shards == {"train/shard-00000.npz"} and not (folder / "manifest.json").exists()
     monkeypatch.undo()
     make(tmp_path)
-    assert contents(folder) == contents(complete_set)
+    assert_same(contents(folder), contents(complete_set))
 
 
 def test_without_egl_the_ray_caster_takes_over_and_says_so(tmp_path):
