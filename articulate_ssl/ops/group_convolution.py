@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 
 import torch
@@ -13,8 +12,8 @@ from torch.nn.functional import embedding_bag
 from articulate_ssl.ops.neighborhood import Neighborhood
 from articulate_ssl.ops.precision import fast_dtype
 
-# Gathered features per tile: on a CPU they stay in cache and in memory that malloc recycles (fresh pages cost more than
-# the arithmetic); on a GPU each tile fills the machine.
+# Gathered features per tile, the largest buffer: on a CPU it stays in cache and in memory that malloc recycles (fresh pages
+# cost more than the arithmetic); on a GPU each tile fills the machine.
 _TILE_ELEMENTS = {"cpu": 2**19, "cuda": 2**26}
 
 
@@ -71,29 +70,28 @@ class _GroupConvolution(torch.autograd.Function):
         tiling = _Tiling(features, weight, index, correlation, permutation)
         grad_out = grad_out.flatten(0, 1)
         grad_features = torch.empty_like(features, memory_format=torch.contiguous_format)
-        grad_weight = weight.new_zeros(
-            tiling.C, tiling.K, weight.shape[2], dtype=torch.promote_types(weight.dtype, torch.float32)
-        )
+        grad_weight = torch.zeros_like(weight, dtype=torch.promote_types(weight.dtype, torch.float32))
         with torch.autocast(weight.device.type, enabled=False):
             for elements in tiling.element_blocks():
                 kernel = tiling.kernel(elements)
                 block = tiling.block(elements)
-                grad_kernel = torch.zeros_like(kernel)
+                grad_kernel = tiling.grad_kernel(elements)
                 for samples in tiling.sample_blocks():
                     grad = grad_out[tiling.rows(samples), elements].transpose(0, 1)  # [s, b M, C']
-                    grad_kernel.baddbmm_(tiling.aggregate(block, samples).transpose(1, 2), grad)
+                    aggregate = tiling.aggregate(block, samples).transpose(1, 2)
+                    grad_kernel.baddbmm_(aggregate, grad, beta=min(1, samples.start))
                     grad_aggregate = tiling.grad_aggregate(grad, kernel)
                     grad_features[samples, :, elements] = tiling.scatter(grad_aggregate, samples)
-                for g, grad_element in zip(range(tiling.G)[elements], grad_kernel, strict=True):
-                    grad_weight += grad_element.view_as(grad_weight)[:, permutation[g]]
-        return grad_features, grad_weight.transpose(0, 1).to(weight.dtype), None, None, None
+                for slot, grad_element in zip(tiling.slot[elements], grad_kernel, strict=True):
+                    grad_weight.index_add_(0, slot, grad_element.view_as(weight).to(grad_weight.dtype))
+        return grad_features, grad_weight.to(weight.dtype), None, None, None
 
 
 class _Tiling:
-    """The aggregate of some samples and group elements at a time, in buffers that every tile uses again.
+    """The aggregate of some group elements and samples at a time, in buffers that every tile uses again.
 
-    Layout: aggregates and kernels have the flat axis (c, k'), k' counting the unrotated kernel points, so that a block
-    of aggregates is one operand of a matrix product without a copy; row permutation[g, k] of element g's kernel is W_k.
+    Layout: aggregates and kernels have the flat axis (k', c), k' counting the unrotated kernel points. A tile of one
+    group element is then an operand of a matrix product as it is, and so are its neighbours' features.
     """
 
     def __init__(
@@ -101,20 +99,22 @@ class _Tiling:
     ) -> None:
         self.B, self.N, self.G, self.C = features.shape
         _, self.M, self.n, self.K = correlation.shape
-        self.features, self.weight, self.index = features, weight, index
+        self.features, self.weight = features, weight
         self.correlation = correlation.flatten(0, 1)  # [B M, n, K]
         self.slot = permutation.argsort(dim=1)
         start = torch.arange(self.B, device=index.device) * self.N
         self.flat_index = (index + start[:, None, None]).flatten()
-        # The tile: as many group elements as fit, in blocks of even size, then as many samples.
+        # The tile: as many samples as fit, and if all do, as many group elements.
         budget = _TILE_ELEMENTS[features.device.type]
-        per_element = self.M * self.n * self.C
-        num_blocks = math.ceil(self.G / max(1, budget // per_element))
-        self.s = math.ceil(self.G / num_blocks)
-        self.b = min(self.B, max(1, budget // (per_element * self.s)))
-        self._gathered = features.new_empty(self.b * self.s * per_element)
+        per_sample = self.M * self.n * self.C
+        self.b = min(self.B, max(1, budget // per_sample))
+        self.s = min(self.G, max(1, budget // (per_sample * self.B)))
+        # Even where one sample exceeds it, features are gathered for so few centres that they are still in cache.
+        self.chunk = max(1, budget // (2 * self.n * self.s * self.C))
+        self._gathered = features.new_empty(min(self.chunk, self.b * self.M) * self.n * self.s * self.C)
         self._aggregate = features.new_empty(self.b * self.M * self.s * self.C * self.K)
-        self._grad_aggregate: Tensor | None = None
+        self._kernel = weight.new_empty(self.s, *weight.shape)
+        self._grad_kernel: Tensor | None = None
         self._bags: tuple[Tensor, Tensor] | None = None
 
     def element_blocks(self) -> Iterator[slice]:
@@ -128,44 +128,60 @@ class _Tiling:
         return slice(samples.start * self.M, samples.stop * self.M)
 
     def kernel(self, elements: slice) -> Tensor:
-        """[s, C K, C'] weights of the group elements."""
-        return self.weight.transpose(0, 1)[:, self.slot[elements]].transpose(0, 1).flatten(1, 2)
+        """[s, K C, C'] weights of the group elements."""
+        slot = self.slot[elements]
+        out = self._kernel[: len(slot)]
+        torch.index_select(self.weight, 0, slot.flatten(), out=out.flatten(0, 1))
+        return out.flatten(1, 2)
+
+    def grad_kernel(self, elements: slice) -> Tensor:
+        """[s, K C, C'] room for the gradient of `kernel`."""
+        if self._grad_kernel is None:
+            self._grad_kernel = torch.empty_like(self._kernel)
+        return self._grad_kernel[: elements.stop - elements.start].flatten(1, 2)
 
     def block(self, elements: slice) -> Tensor:
         """[B N, s C] features of the group elements."""
         return self.features[:, :, elements].reshape(self.B * self.N, -1)
 
     def aggregate(self, block: Tensor, samples: slice) -> Tensor:
-        """[s, b M, C K] correlation-weighted sum of the neighbours' features."""
-        rows, width = self.rows(samples), block.shape[1]
-        count = rows.stop - rows.start
-        gathered = self._gathered[: count * self.n * width].view(-1, width)
-        torch.index_select(block, 0, self.flat_index[rows.start * self.n : rows.stop * self.n], out=gathered)
-        aggregate = self._aggregate[: count * width * self.K].view(count, width, self.K)
-        torch.bmm(gathered.view(count, self.n, width).transpose(1, 2), self.correlation[rows], out=aggregate)
-        return aggregate.view(count, -1, self.C * self.K).transpose(0, 1)
+        """[s, b M, K C] correlation-weighted sum of the neighbours' features."""
+        first, last, width = self.rows(samples).start, self.rows(samples).stop, block.shape[1]
+        aggregate = self._aggregate[: (last - first) * self.K * width].view(-1, self.K, width)
+        for row in range(first, last, self.chunk):
+            stop = min(row + self.chunk, last)
+            gathered = self._gathered[: (stop - row) * self.n * width].view(-1, width)
+            torch.index_select(block, 0, self.flat_index[row * self.n : stop * self.n], out=gathered)
+            torch.bmm(
+                self.correlation[row:stop].transpose(1, 2),
+                gathered.view(stop - row, self.n, width),
+                out=aggregate[row - first : stop - first],
+            )
+        return aggregate.unflatten(2, (-1, self.C)).permute(2, 0, 1, 3).flatten(2)
 
     def grad_aggregate(self, grad: Tensor, kernel: Tensor) -> Tensor:
-        """[b M, s C, K] gradient of the aggregate from that of the output."""
-        if self._grad_aggregate is None:
-            self._grad_aggregate = torch.empty_like(self._aggregate)
+        """[b M, K, s C] gradient of the aggregate from that of the output; takes the place of the aggregate."""
         s, count, _ = grad.shape
-        out = self._grad_aggregate[: s * count * self.C * self.K].view(count, s, self.C * self.K)
-        torch.bmm(grad, kernel.transpose(1, 2), out=out.transpose(0, 1))
-        return out.view(count, s * self.C, self.K)
+        out = self._aggregate[: s * count * self.K * self.C].view(s, count, self.K * self.C)
+        torch.bmm(grad, kernel.transpose(1, 2), out=out)
+        return out.unflatten(2, (self.K, self.C)).permute(1, 2, 0, 3).flatten(2)
 
     def scatter(self, grad_aggregate: Tensor, samples: slice) -> Tensor:
         """[b, N, s, C] gradient of the features: the transpose of `aggregate`, summed in a fixed order."""
-        count, width, _ = grad_aggregate.shape
-        grad_gathered = self._gathered[: count * self.n * width].view(count, self.n, width)
-        torch.bmm(self.correlation[self.rows(samples)], grad_aggregate.transpose(1, 2), out=grad_gathered)
+        count, _, width = grad_aggregate.shape
         if self._bags is None:
-            sorted_index, order = self.index.flatten(1).sort(dim=1, stable=True)
-            points = torch.arange(self.N, device=order.device).expand(self.B, -1)
-            self._bags = order, torch.searchsorted(sorted_index, points.contiguous())
+            self._grad_gathered = self.features.new_empty(self.b * self.M * self.n * self.s * self.C)
+            order = self.flat_index.sort(stable=True)
+            bags = torch.arange(self.B * self.N, device=order.indices.device)
+            self._bags = order.indices, torch.searchsorted(order.values, bags)
+        grad_gathered = self._grad_gathered[: count * self.n * width].view(count, self.n, width)
+        torch.bmm(self.correlation[self.rows(samples)], grad_aggregate, out=grad_gathered)
         order, start = self._bags
-        b = samples.stop - samples.start
-        offset = torch.arange(b, device=order.device)[:, None] * (self.M * self.n)
-        bags = (order[samples] + offset).flatten(), (start[samples] + offset).flatten()
-        summed = embedding_bag(bags[0], grad_gathered.flatten(0, 1), bags[1], mode="sum")
-        return summed.view(b, self.N, -1, self.C)
+        first, last = samples.start * self.M * self.n, samples.stop * self.M * self.n
+        summed = embedding_bag(
+            order[first:last] - first,
+            grad_gathered.flatten(0, 1),
+            start[samples.start * self.N : samples.stop * self.N] - first,
+            mode="sum",
+        )
+        return summed.view(samples.stop - samples.start, self.N, -1, self.C)
