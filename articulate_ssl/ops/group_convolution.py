@@ -12,8 +12,8 @@ from torch.nn.functional import embedding_bag
 from articulate_ssl.ops.neighborhood import Neighborhood
 from articulate_ssl.ops.precision import fast_dtype
 
-# Gathered features per tile, the largest buffer: on a CPU it stays in cache and in memory that malloc recycles (fresh pages
-# cost more than the arithmetic); on a GPU each tile fills the machine.
+# Gathered features per tile, the largest buffer: on a CPU it stays in cache and in memory that malloc recycles (fresh
+# pages cost more than the arithmetic); on a GPU each tile fills the machine.
 _TILE_ELEMENTS = {"cpu": 2**19, "cuda": 2**26}
 
 

@@ -59,7 +59,9 @@ def pose_aware_convolution(
 ) -> Tensor:  # [B, N, G, C'] camera frame
     """Paper Eq. 2 neighbour by neighbour, as the original: every pair aligned, matched with the group, and correlated.
 
-    With identity poses this is what the original runs for each layer of its backbone.
+    With identity poses this is what the original runs for each layer of its backbone, with its two large intermediates:
+    products of every pair's rotation and all group elements with all group elements (4.25 GB at paper size), and
+    correlation weights of every pair, group element and kernel point.
     """
     B, N = points.shape[:2]
     sigma = INFLUENCE * radius**2
@@ -74,7 +76,9 @@ def pose_aware_convolution(
         aligned = poses[:, :, None] @ invert_se3(poses)[sample, index]  # [B, N, n, 4, 4] P_i P_j^{-1}
         offset = transform_points(aligned, points[sample, index][..., None, :]).squeeze(-2) - points[:, :, None]
         relative = rotation[sample, index] @ rotation[:, :, None].transpose(-1, -2)  # R_j R_i^{-1}
-        match = group.nearest(relative[..., None, :, :] @ elements)  # [B, N, n, G]
+        turned = relative[..., None, :, :] @ elements
+        relation = torch.einsum("bmngij,hkj->bmnghik", turned, elements)  # [B, N, n, G, G, 3, 3]
+        match = relation.diagonal(dim1=-2, dim2=-1).sum(dim=-1).argmax(dim=-1)  # [B, N, n, G] largest trace
         rotated = torch.einsum("gxy,ky->gkx", elements, KERNEL_RADIUS * radius * kernel.points.to(points))
         square = (offset[:, :, :, None, None] - rotated).square().sum(dim=-1)  # [B, N, n, G, K]
         inside = (distance <= radius).to(points)
