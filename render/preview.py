@@ -142,7 +142,7 @@ def _save(figure: Figure, path: Path) -> None:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
-    picture.quantize(128, Image.Quantize.MAXCOVERAGE).save(path, optimize=True)
+    picture.quantize(256, Image.Quantize.MEDIANCUT).save(path, optimize=True)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -13,10 +13,12 @@ import signal
 import subprocess
 import sys
 import time
+from multiprocessing import forkserver
 from pathlib import Path
 
 import dask
 import numpy as np
+import psutil
 import pytest
 import torch
 from dask.distributed import LocalCluster
@@ -167,26 +169,30 @@ def test_unreachable_scheduler_is_a_clear_error(tmp_path, capsys):
 
 
 def test_killed_runs_resume_to_the_same_bytes(tmp_path):
-    """SIGKILL at several moments; no file under a final name is ever half written."""
+    """SIGKILL at several moments; no file under a final name is ever half written, and no worker lives on."""
+    options = ("--points", "512", "--workers", "2")
     expected = contents(make(tmp_path / "whole", "--points", "512", train=6))
+    forkserver.ensure_running()
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["render.generate", "render.sources.procedural"])
-    folder, kills = None, 0
-    for delay in (0.05, 0.15, 0.3, 0.6):
-        process = context.Process(target=make, args=(tmp_path / "killed", "--points", "512"), kwargs={"train": 6})
+    bystanders = set(psutil.Process().children(recursive=True))
+    folder, kills = set_folder(tmp_path / "killed", "laptop"), 0
+    for delay in (0.05, 0.5, 1.0):
+        process = context.Process(target=make, args=(tmp_path / "killed", *options), kwargs={"train": 6})
         process.start()
-        folder = set_folder(tmp_path / "killed", "laptop")
         wait_for(folder / ".journal.jsonl", process)
         time.sleep(delay)
         if process.is_alive():
             os.kill(process.pid, signal.SIGKILL)
             kills += 1
+        workers = set(psutil.Process().children(recursive=True)) - bystanders
         process.join()
+        assert psutil.wait_procs(workers, timeout=30)[1] == []
         found = contents(folder)
         assert all(found[name] == expected[name] for name in found if not Path(name).name.startswith("."))
     assert kills > 0
-    make(tmp_path / "killed", "--points", "512", train=6)
-    assert contents(folder) == expected, "and nothing else is left behind"
+    make(tmp_path / "killed", *options, train=6)
+    assert_same(contents(folder), expected)  # and nothing else is left behind
 
 
 def wait_for(path: Path, process: multiprocessing.Process) -> None:
