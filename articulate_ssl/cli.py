@@ -12,10 +12,13 @@ from pathlib import Path
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command and return its exit code: 0, or 2 for bad arguments or bad input (one message, no traceback)."""
+    from articulate_ssl.ops.denormals import flush_denormals
+
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    if arguments[:1] == ["predict"]:
-        return _predict(arguments[1:])
-    return _learn(arguments)
+    with flush_denormals():
+        if arguments[:1] == ["predict"]:
+            return _predict(arguments[1:])
+        return _learn(arguments)
 
 
 def _predict(arguments: list[str]) -> int:
@@ -56,7 +59,7 @@ def _learn(arguments: list[str]) -> int:
             """Configurations decide, not what a checkpoint remembers; `_use_checkpoint` compares the two."""
 
         def _use_checkpoint(self, subcommand: str) -> None:
-            """Only trained weights of this category are scored: a bare `lightning test` would score random ones."""
+            """Only trained weights are scored: a bare `lightning test` would score random ones."""
             options = self.config_init[subcommand]
             if options.get("ckpt_path") is None:
                 folder = Path(self.trainer.default_root_dir)
@@ -67,7 +70,10 @@ def _learn(arguments: list[str]) -> int:
                         "run `lightning fit -c …` first, or pass --ckpt_path"
                     )
                 options["ckpt_path"] = str(found[-1])
-            path = options["ckpt_path"]
+            self._check_checkpoint(subcommand, options["ckpt_path"])
+
+        def _check_checkpoint(self, subcommand: str, path: str) -> None:
+            """Weights of another category or network would load, or fail obscurely."""
             remembered = read_checkpoint(path)["hyper_parameters"]
             if remembered.get("network") != self.model.hparams["network"]:
                 raise CheckpointError(
@@ -80,6 +86,11 @@ def _learn(arguments: list[str]) -> int:
                     f"{path}: trained on category {trained_on!r}, but the data are {self.model.category!r}; "
                     f"use configs/{trained_on}.yaml or another checkpoint"
                 )
+
+        def before_fit(self) -> None:
+            path = self.config_init["fit"].get("ckpt_path")
+            if path is not None:
+                self._check_checkpoint("fit", path)
 
         def before_test(self) -> None:
             self._use_checkpoint("test")

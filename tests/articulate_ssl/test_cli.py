@@ -67,7 +67,7 @@ def test_a_missing_or_truncated_checkpoint_is_refused(run, workplace):
     _refused(run("test", "-c", "laptop.yaml", "--ckpt_path", "cut.ckpt"), "cut.ckpt", "damaged")
 
 
-@pytest.mark.parametrize("command", ["test", "validate"])
+@pytest.mark.parametrize("command", ["fit", "test", "validate"])
 def test_a_checkpoint_of_another_category_is_refused(run, workplace, command):
     content = torch.load(workplace / "trained.ckpt", weights_only=True)
     content["hyper_parameters"]["category"] = "oven"
