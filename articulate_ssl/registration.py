@@ -14,12 +14,17 @@ import torch
 from torch import Tensor
 
 from articulate_ssl.kinematic_chain import KinematicChain
+from articulate_ssl.ops.denormals import flush_denormals
 from datamodules.geometry import REVOLUTE, invert_se3, screw_motion, se3, transform_points
 
 _BATCH_ENTRIES = 2**22  # entries of one responsibility matrix
 
+# What turns a part about an axis by so little (a thin rod about its length) is noise: such a rotation stays as it was.
+_INERTIA = 0.02
+
 # Points, correspondence scales, rounds and survivors of each stage of a search.
-_HALVING = ((48, (0.14, 0.10), 2, 24), (96, (0.10, 0.04), 5, 4), (1 << 30, (0.05, 0.02), 8, 1))
+_HALVING = ((48, (0.14, 0.10), 2, 24), (96, (0.10, 0.04), 5, 4), (256, (0.05, 0.02), 12, 4))
+_SAME = 0.5  # radians: orientations closer than this are one hypothesis
 
 
 @dataclass(frozen=True)
@@ -36,6 +41,19 @@ class LabelledTemplate:
     label: Tensor
     num_parts: int
 
+    def thinned(self, num_points: int) -> LabelledTemplate:
+        """About `num_points` points, the same share of every part and at least 4 of each."""
+        share = num_points / len(self.label)
+        if share >= 1:
+            return self
+        rows = []
+        for part in range(self.num_parts):
+            mine = (self.label == part).nonzero().squeeze(-1)
+            count = min(len(mine), max(4, round(share * len(mine))))
+            rows.append(mine[torch.linspace(0, len(mine) - 1, count).round().long()])
+        rows = torch.cat(rows).sort().values
+        return LabelledTemplate(self.points[..., rows, :], self.label[rows], self.num_parts)
+
     def posed(self, pose: Tensor) -> Tensor:
         """Points moved with their part, pose [n, K, 4, 4] -> [n, T, 3]."""
         pose = pose[:, self.label]
@@ -51,12 +69,14 @@ class JointModel:
         axis: [J, 3] unit, or [n, J, 3].
         pivot: [J, 3] or [n, J, 3].
         joint_type: `REVOLUTE` or `PRISMATIC`.
+        limits: [J, 2] lowest and highest joint state, or None.
     """
 
     chain: KinematicChain
     axis: Tensor
     pivot: Tensor
     joint_type: int
+    limits: Tensor | None = None
 
     def articulation(self, state: Tensor) -> Tensor:
         """Part motions [n, K, 4, 4] in canonical object space at joint states [n, J]."""
@@ -73,15 +93,19 @@ class JointModel:
         """Joint states [n, J] that fit freely estimated part poses [n, K, 4, 4] best."""
         states = []
         for j, (parent, child) in enumerate(zip(self.chain.parent, self.chain.child, strict=True)):
-            relative = invert_se3(pose[:, parent]) @ pose[:, child]
-            axis = self.axis[..., j, :]
+            rest = template.points[..., template.label == child, :]  # [(n,) m, 3]
+            moved = transform_points(invert_se3(pose[:, parent]) @ pose[:, child], rest)
+            axis, pivot = self.axis[..., j, None, :], self.pivot[..., j, None, :]
             if self.joint_type == REVOLUTE:
-                motion = roma.rotmat_to_rotvec(relative[:, :3, :3])
+                # The angle about the joint line that brings the part's points closest to where they were moved.
+                radius, moved = rest - pivot, moved - pivot
+                side = torch.linalg.cross(axis.expand_as(radius), radius)
+                flat = radius - (radius * axis).sum(dim=-1, keepdim=True) * axis
+                states.append(torch.atan2((side * moved).sum(dim=(-2, -1)), (flat * moved).sum(dim=(-2, -1))))
             else:
-                center = template.points[..., template.label == child, :].mean(dim=-2).expand(len(pose), 3)
-                motion = transform_points(relative, center[:, None])[:, 0] - center
-            states.append((motion * axis).sum(dim=-1))
-        return torch.stack(states, dim=-1)
+                states.append(((moved - rest).mean(dim=-2) * axis.squeeze(-2)).sum(dim=-1))
+        state = torch.stack(states, dim=-1)
+        return state if self.limits is None else state.clamp(*self.limits.unbind(-1))
 
 
 def chamfer_l1(
@@ -98,6 +122,7 @@ def chamfer_l1(
     return torch.cat(errors)
 
 
+@flush_denormals()
 def update_poses(
     template: LabelledTemplate,
     pose: Tensor,  # [n, K, 4, 4]
@@ -120,7 +145,7 @@ def update_poses(
         if len(mine) < 4:
             poses.append(pose[:, part])
             continue
-        poses.append(_register(points[:, mine], target[:, mine], weight[:, mine]))
+        poses.append(_register(points[:, mine], target[:, mine], weight[:, mine], pose[:, part, :3, :3]))
     return torch.stack(poses, dim=1)
 
 
@@ -172,7 +197,8 @@ def register_articulated(
     for scale in _annealed(scales, rounds):
         free = update_poses(template, joints.part_pose(base, state), clouds, scale)
         state = joints.read_states(template, free)
-        base = _register(template.posed(joints.part_pose(still, state)), template.posed(free))
+        shape = template.posed(joints.part_pose(still, state))
+        base = se3(*roma.rigid_points_registration(shape, template.posed(free)))
     return base, state, chamfer_l1(clouds, template.posed(joints.part_pose(base, state)), bidirectional)
 
 
@@ -185,7 +211,9 @@ def search_articulated(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Best articulated registration of every cloud over all orientations and joint states.
 
-    Successive halving: all starts get two rounds on few points, the better ones some more, the last few all points.
+    Successive halving: all starts get two rounds on few points, the better ones some more, and a few different ones
+    the last. All points decide between those: what tells a laptop's lid from its base is finer than the spacing of the
+    few points that suffice to register it.
 
     Returns:
         Base poses [n, 4, 4], joint states [n, J], Chamfer-L1 errors [n].
@@ -197,19 +225,46 @@ def search_articulated(
     state = states.repeat(len(rotations), 1).expand(len(clouds), -1, -1)
     rows = torch.arange(len(clouds), device=clouds.device)[:, None]
     for num_points, scales, rounds, survivors in _HALVING:
-        every = max(1, len(template.label) // num_points)
-        shape = LabelledTemplate(template.points[..., ::every, :], template.label[::every], template.num_parts)
         count = base.shape[1]
         copies = clouds[:, :num_points].repeat_interleave(count, dim=0)
-        flat = register_articulated(shape, joints, copies, base.flatten(0, 1), state.flatten(0, 1), scales, rounds)
+        flat = register_articulated(
+            template.thinned(num_points), joints, copies, base.flatten(0, 1), state.flatten(0, 1), scales, rounds
+        )
         base, state, error = (value.unflatten(0, (len(clouds), count)) for value in flat)
-        best = error.topk(min(survivors, count), largest=False).indices
+        if survivors > 4:
+            best = error.topk(min(survivors, count), largest=False).indices
+        else:
+            best = _different(base, error, min(survivors, count))
         base, state, error = base[rows, best], state[rows, best], error[rows, best]
-    return base[:, 0], state[:, 0], error[:, 0]
+    posed = template.posed(joints.part_pose(base.flatten(0, 1), state.flatten(0, 1)))
+    error = chamfer_l1(clouds.repeat_interleave(base.shape[1], dim=0), posed).unflatten(0, (len(clouds), -1))
+    best = error.argmin(dim=1, keepdim=True)
+    return base[rows, best][:, 0], state[rows, best][:, 0], error[rows, best][:, 0]
 
 
-def _register(source: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
-    return se3(*roma.rigid_points_registration(source, target, weights=weight))
+def _different(base: Tensor, error: Tensor, count: int) -> Tensor:
+    """Indices [n, count] of the best hypotheses, passing over those turned like a better one while others are left."""
+    rows = torch.arange(len(base), device=base.device)
+    left, chosen = error.clone(), []
+    for _ in range(count):
+        best = left.argmin(dim=1)
+        chosen.append(best)
+        angle = roma.rotmat_geodesic_distance(base[..., :3, :3], base[rows, best, None, :3, :3])
+        left = (left + 1e3 * (angle < _SAME)).scatter(1, best[:, None], torch.inf)
+    return torch.stack(chosen, dim=1)
+
+
+def _register(source: Tensor, target: Tensor, weight: Tensor, before: Tensor) -> Tensor:
+    """Weighted Kabsch [n, 4, 4], as if the source were `_INERTIA` thicker and the extra had moved with `before`."""
+    weight = (weight / weight.sum(dim=-1, keepdim=True))[..., None]
+    source_mean, target_mean = (weight * source).sum(dim=1), (weight * target).sum(dim=1)
+    source_offset = source - source_mean[:, None]
+    covariance = (weight * (target - target_mean[:, None])).transpose(1, 2) @ source_offset
+    # Soft targets are drawn together; the extra must be as much.
+    size = (weight * source_offset).transpose(1, 2) @ source_offset
+    shrinkage = covariance.norm(dim=(1, 2)) / size.norm(dim=(1, 2)).clamp(min=1e-12)
+    rotation = roma.special_procrustes(covariance + (_INERTIA**2 * shrinkage)[:, None, None] * before)
+    return se3(rotation, target_mean - (rotation @ source_mean[..., None]).squeeze(-1))
 
 
 def _squared_distances(cloud: Tensor, posed: Tensor) -> Tensor:

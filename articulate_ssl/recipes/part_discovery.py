@@ -16,22 +16,23 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 
-import roma
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from articulate_ssl.groups import rotation_group
 from articulate_ssl.kinematic_chain import extract_chain, pair_index
+from articulate_ssl.recipes.screw_fit import fit_screw
 from articulate_ssl.registration import (
     JointModel,
     LabelledTemplate,
     chamfer_l1,
+    register_articulated,
     register_rigid,
     search_articulated,
     update_poses,
 )
-from datamodules.geometry import PRISMATIC, invert_se3, screw_motion, se3, transform_points
+from datamodules.geometry import invert_se3, se3, transform_points
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +50,9 @@ class DiscoveryOptions:
         split_clouds: The best aligned of them, on which splits are tried.
         search_clouds: Those on which labels and joints are solved again; all are registered in the end.
         points: Points per cloud and template in registration.
+        dense_points: The same where it is decided between registrations.
         starts: Random splits.
+        jointed: The splits that explain the clouds best, to which joints are fitted.
         rounds: Rounds of articulated search, relabelling and joint fitting.
         keep: Share of the clouds, best fitted first, that labels and joints are solved from.
         min_share: Splits with a part smaller than this share of the template are discarded.
@@ -60,7 +63,9 @@ class DiscoveryOptions:
     split_clouds: int = 48
     search_clouds: int = 96
     points: int = 256
-    starts: int = 12
+    dense_points: int = 1024
+    starts: int = 24
+    jointed: int = 6
     rounds: int = 3
     keep: float = 0.75
     min_share: float = 0.05
@@ -104,16 +109,17 @@ def discover(
     Raises:
         DiscoveryError: if no split into `num_parts` moving parts survives.
     """
-    clouds = clouds[:, : options.points].contiguous()
+    clouds = clouds[:, : options.dense_points].contiguous()
     reference = clouds[choose_reference(clouds)]
     rotations = rotation_group(60).elements.to(clouds)
     coarse = max(64, options.points // 2)
     few = clouds[:: max(1, len(clouds) // options.search_clouds)][: options.search_clouds]
-    rigid, error = register_rigid(reference[:coarse], few[:, :coarse], rotations, keep=1)
+    thin = few[:, : options.points]
+    rigid, error = register_rigid(reference[:coarse], thin[:, :coarse], rotations, keep=1)
     log.info("rigid alignment: median Chamfer-L1 %.4f", error[:, 0].median())
 
     best_aligned = error[:, 0].argsort()[: options.split_clouds]
-    aligned = transform_points(invert_se3(rigid[best_aligned, 0]), few[best_aligned])
+    aligned = transform_points(invert_se3(rigid[best_aligned, 0]), thin[best_aligned])
     found = split_template(aligned, reference, num_parts, joint_type, options)
     log.info("best split of %d starts: Chamfer-L1 %.4f", options.starts, found.error.mean())
 
@@ -123,12 +129,12 @@ def discover(
         pose = found.joints.part_pose(base[kept], state[kept])
         template = found.template
         for scale in (0.03, 0.028, 0.026, 0.024, 0.022, 0.02):
-            pose = update_poses(template, pose, few[kept], scale)
-            template = relabel(template, pose, few[kept], cap=4 * scale)
+            pose = update_poses(template.thinned(options.points), pose, thin[kept], scale)
+            template = relabel(template, pose, thin[kept], cap=4 * scale)
         if torch.bincount(template.label, minlength=num_parts).min() < options.min_share * len(template.label):
             log.warning("round %d lost a part; keeping the parts of the round before", step + 1)
             break
-        found = fit_joints(template, pose, few[kept], joint_type)
+        found = fit_joints(template, pose, thin[kept], joint_type)
         log.info("round %d: Chamfer-L1 %.4f of the kept clouds", step + 1, found.error.mean())
     base, state, error = _search(found, clouds, rotations)
     return replace(found, base=base, state=state, error=error)
@@ -136,8 +142,13 @@ def discover(
 
 def _search(found: ArticulatedTemplate, clouds: Tensor, rotations: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     spread = 1.5 * found.state.std(dim=0)
-    states = torch.stack([-spread, torch.zeros_like(spread), spread])
-    return search_articulated(found.template, found.joints, clouds, rotations, states)
+    # The middle, and every combination of either side.
+    states = torch.cartesian_prod(*torch.stack([-spread, spread], dim=-1)).view(-1, len(spread))
+    states = torch.cat([torch.zeros_like(states[:1]), states])
+    limits = torch.quantile(found.state, torch.tensor([0.05, 0.95]).to(states), dim=0)
+    margin = 0.15 * (limits[1] - limits[0])
+    joints = replace(found.joints, limits=torch.stack([limits[0] - margin, limits[1] + margin], dim=-1))
+    return search_articulated(found.template, joints, clouds, rotations, states)
 
 
 def dense_template(
@@ -188,7 +199,7 @@ def random_split(template: Tensor, num_parts: int, generator: torch.Generator) -
     """[T] labels from K - 1 parallel cuts along a random direction, at random quantiles."""
     direction = functional.normalize(torch.randn(3, generator=generator), dim=0)
     height = template @ direction.to(template)
-    cuts = (torch.rand(num_parts - 1, generator=generator) * 0.6 + 0.2).sort().values
+    cuts = (torch.rand(num_parts - 1, generator=generator) * 0.8 + 0.1).sort().values
     return torch.bucketize(height, torch.quantile(height, cuts.to(template)))
 
 
@@ -205,26 +216,30 @@ def split_template(
         DiscoveryError: if every start loses a part.
     """
     generator = torch.Generator().manual_seed(options.seed)
-    best: ArticulatedTemplate | None = None
+    splits = []
     for _ in range(options.starts):
         labelled = LabelledTemplate(template, random_split(template, num_parts, generator), num_parts)
         pose = torch.eye(4).to(template).expand(len(aligned), num_parts, 4, 4)
         for step, scale in enumerate(torch.logspace(-1.1, -1.7, 16).tolist()):
-            pose = update_poses(labelled, pose, aligned, scale)
+            pose = update_poses(labelled.thinned(options.points), pose, aligned, scale)
             if step % 2 == 1:
                 labelled = relabel(labelled, pose, aligned, cap=4 * scale)
         share = torch.bincount(labelled.label, minlength=num_parts) / len(template)
-        if share.min() < options.min_share:
-            continue
-        found = fit_joints(labelled, pose, aligned, joint_type)
-        if best is None or found.error.mean() < best.error.mean():
-            best = found
-    if best is None:
+        if share.min() >= options.min_share:
+            splits.append((_trimmed(chamfer_l1(aligned, labelled.posed(pose)), options), labelled, pose))
+    if not splits:
         raise DiscoveryError(
             f"part discovery lost a part in all {options.starts} starts: the clouds do not show {num_parts} parts that "
             "move on their own; check the category's number of parts, or allow more starts"
         )
-    return best
+    splits.sort(key=lambda split: split[0])
+    fits = [fit_joints(labelled, pose, aligned, joint_type) for _, labelled, pose in splits[: options.jointed]]
+    return min(fits, key=lambda found: _trimmed(found.error, options))
+
+
+def _trimmed(error: Tensor, options: DiscoveryOptions) -> float:
+    """Mean error of the clouds that fit best: some are aligned wrongly."""
+    return float(error.sort().values[: max(1, int(options.keep * len(error)))].mean())
 
 
 def relabel(
@@ -232,7 +247,7 @@ def relabel(
     pose: Tensor,  # [n, K, 4, 4]
     clouds: Tensor,  # [n, N, 3]
     cap: float,  # distances beyond this count as this
-    neighbors: int = 8,
+    neighbors: int = 16,
 ) -> LabelledTemplate:
     """Give every template point to the part whose motion brings it closest to the clouds, smoothed over neighbours."""
     cost = template.points.new_zeros(len(template.points), template.num_parts)
@@ -255,16 +270,17 @@ def fit_joints(
     gaps = []
     for i, j in pair_index(num_parts).tolist():
         relative = invert_se3(pose[:, i]) @ pose[:, j]
-        axis, pivot, state, mean = _fit_screw(relative, joint_type)
-        model = screw_motion(axis.expand(len(state), 3), pivot.expand(len(state), 3), state, joint_type) @ mean
-        part = template.points[template.label == j]
-        gaps.append((transform_points(model, part) - transform_points(relative, part)).norm(dim=-1).mean())
+        # What fits must fit from either side.
+        gap = fit_screw(relative, template.points[template.label == j], joint_type).gap
+        inverse = fit_screw(invert_se3(relative), template.points[template.label == i], joint_type).gap
+        gaps.append(gap.median() + inverse.median())
     chain = extract_chain(-torch.stack(gaps), num_parts)
 
     into_object = {chain.root: torch.eye(4).to(pose)}
     axes, pivots, states = [], [], []
     for parent, child in zip(chain.parent, chain.child, strict=True):
-        axis, pivot, state, mean = _fit_screw(invert_se3(pose[:, parent]) @ pose[:, child], joint_type)
+        moving = template.points[template.label == child]
+        axis, pivot, state, mean, _ = fit_screw(invert_se3(pose[:, parent]) @ pose[:, child], moving, joint_type)
         frame = into_object[parent]
         into_object[child] = frame @ mean
         axis = frame[:3, :3] @ axis
@@ -289,7 +305,8 @@ def fit_joints(
     joints = JointModel(chain, axis, pivot, joint_type)
     template, state = replace(template, points=points), torch.stack(states, dim=1)
     base = pose[:, chain.root] @ invert_se3(frame)
-    error = chamfer_l1(clouds, template.posed(joints.part_pose(base, state)))
+    few = template.thinned(clouds.shape[1])
+    base, state, error = register_articulated(few, joints, clouds, base, state, (0.03, 0.02), 8)
     return ArticulatedTemplate(template, joints, base, state, error)
 
 
@@ -299,25 +316,3 @@ def _principal_frame(points: Tensor) -> Tensor:
     axes = torch.linalg.eigh((points - center).T @ (points - center)).eigenvectors
     axes = axes * torch.sign(torch.linalg.det(axes))
     return se3(axes.T, -(axes.T @ center))
-
-
-def _fit_screw(relative: Tensor, joint_type: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Axis [3], pivot [3], states [n], mean [4, 4]: relative poses [n, 4, 4] ~ screw(axis, pivot, state) @ mean."""
-    mean_rotation = roma.special_procrustes(relative[:, :3, :3].mean(dim=0))
-    if joint_type == PRISMATIC:
-        mean = se3(mean_rotation, relative[:, :3, 3].mean(dim=0))
-        shift = relative[:, :3, 3] - mean[:3, 3]
-        axis = torch.linalg.eigh(shift.T @ shift).eigenvectors[:, -1]
-        return axis, torch.zeros_like(axis), shift @ axis, mean
-    turn = roma.rotmat_to_rotvec(relative[:, :3, :3] @ mean_rotation.T)
-    axis = torch.linalg.eigh(turn.T @ turn).eigenvectors[:, -1]
-    state = turn @ axis
-    rotation = roma.rotvec_to_rotmat(axis * state[:, None])
-    # t_n = R_n t + (1 - R_n) p is linear in the mean translation t and the pivot p, whose component along the axis is
-    # free: the small ridge picks one.
-    eye = torch.eye(3).to(relative)
-    system = torch.cat([torch.cat([rotation, eye - rotation], dim=2).flatten(0, 1), 1e-3 * torch.eye(6).to(relative)])
-    rhs = torch.cat([relative[:, :3, 3].flatten(), relative.new_zeros(6)])
-    # Of full rank by the ridge. The CPU's default driver rounds differently from call to call; this one does not.
-    solution = torch.linalg.lstsq(system, rhs[:, None], driver="gels").solution.squeeze(-1)
-    return axis, solution[3:], state, se3(mean_rotation, solution[:3])

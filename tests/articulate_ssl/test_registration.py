@@ -1,6 +1,7 @@
 """Registration recovers known poses from perturbed starts, every cloud on its own."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import roma
@@ -12,9 +13,11 @@ from articulate_ssl.kinematic_chain import KinematicChain
 from articulate_ssl.registration import (
     JointModel,
     LabelledTemplate,
+    _different,
     chamfer_l1,
     register_articulated,
     register_rigid,
+    search_articulated,
     update_poses,
 )
 from datamodules.geometry import se3
@@ -65,6 +68,59 @@ def test_a_rigid_template_finds_every_orientation():
     )
     assert pose.shape == (3, 2, 4, 4) and error.shape == (3, 2)
     assert error[:, 0].max() < 0.02 and (error[:, 0] <= error[:, 1]).all()
+
+
+def test_states_stay_within_the_limits():
+    data = clouds(LAPTOP)
+    template, joints = _model(LAPTOP, data)
+    middle = data.state.median()
+    limits = torch.stack([data.state.min(dim=0).values, middle[None]], dim=-1)
+    read = replace(joints, limits=limits).read_states(template, joints.part_pose(data.base, data.state))
+    torch.testing.assert_close(read, data.state.clamp(max=middle), rtol=1e-4, atol=1e-4)
+
+
+def test_a_rod_keeps_its_roll():
+    """Noise turns it about its length as easily as not; only what the points can tell may turn it."""
+    generator = torch.Generator().manual_seed(0)
+    rod = torch.randn(128, 3, generator=generator) * torch.tensor([0.3, 0.002, 0.002])
+    turn = roma.rotvec_to_rotmat(torch.tensor([0.0, 0.0, 0.3]))
+    moved = rod @ turn.T
+    cloud = (moved + 0.004 * torch.randn(8, 128, 3, generator=generator)).contiguous()
+    template = LabelledTemplate(rod, torch.zeros(128, dtype=torch.long), 1)
+    pose = torch.eye(4).expand(8, 1, 4, 4)
+    for scale in (0.1, 0.05, 0.03, 0.02):
+        pose = update_poses(template, pose, cloud, scale)
+    assert _degrees(pose[:, 0], turn.expand(8, 3, 3)) < 3
+
+
+def test_a_thinned_template_keeps_every_part():
+    label = torch.zeros(1000, dtype=torch.long)
+    label[::50] = 1  # a plain stride of 50 would see nothing else
+    label[1] = 2
+    template = LabelledTemplate(torch.rand(1000, 3), label, 3)
+    thin = template.thinned(100)
+    assert thin.label.bincount(minlength=3).tolist() == [98, 4, 1]
+    assert template.thinned(1000) is template
+
+
+def test_a_search_rights_an_object_from_any_orientation():
+    data = clouds(LAPTOP, count=4)
+    template, joints = _model(LAPTOP, data)
+    states = torch.tensor([[-0.4], [-1.2]])
+    base, state, error = search_articulated(template, joints, data.points, rotation_group(60).elements.float(), states)
+    assert _degrees(base, data.base) < 3
+    assert (state - data.state).abs().max() < 0.05
+    assert error.max() < 0.03
+
+
+def test_hypotheses_that_are_kept_differ():
+    rotations = rotation_group(60).elements.float()
+    near = roma.rotvec_to_rotmat(torch.tensor([0.1, 0.0, 0.0]))
+    base = torch.eye(4).repeat(1, 4, 1, 1)
+    base[0, :, :3, :3] = torch.stack([rotations[0], near @ rotations[0], rotations[7], near @ rotations[7]])
+    error = torch.tensor([[0.1, 0.2, 0.4, 0.3]])
+    assert _different(base, error, 2).tolist() == [[0, 3]]
+    assert _different(base, error, 4).tolist() == [[0, 3, 1, 2]]  # near ones again once no other is left
 
 
 def test_clouds_do_not_interact():
