@@ -133,8 +133,8 @@ class ArticulatedPoseModule(LightningModule):
     # Prediction
 
     def predict_points(self, points: Tensor, refine: bool | None = None) -> Prediction:
-        """Predictions for normalised clouds [B, N, 3]: see `PoseEstimator.predict`."""
-        return self.estimator.predict(points, refine)
+        """Predictions for normalised clouds [B, N, 3] in farthest-point order: see `PoseEstimator.predict`."""
+        return self.estimator.predict(points, self.num_points, refine)
 
     def predict_cloud(
         self,
@@ -364,15 +364,21 @@ class ArticulatedPoseModule(LightningModule):
     def on_test_start(self) -> None:
         """Relate slots and canonical spaces to the labelled ones, on training clouds."""
         loader = self.trainer.datamodule.calibration_dataloader(self.calibration_samples)
-        batches = [self.transfer_batch_to_device(batch, self.device, 0) for batch in loader]
+        batches = [self._whole(self.transfer_batch_to_device(batch, self.device, 0)) for batch in loader]
         predictions = [self.predict_points(split_labels(batch)[0]["points"]) for batch in batches]
         self.test_report = TestReport(predictions, batches).to(self.device)
 
     def test_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
         """Predict, then compare."""
+        batch = self._whole(batch)
         start = time.perf_counter()
         prediction = self.predict_points(split_labels(batch)[0]["points"])
         self.test_report.update(prediction, batch, time.perf_counter() - start)
+
+    def _whole(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """The batch with as many points as registration reads; the networks still see those that they would."""
+        count = max(batch["points"].shape[1], self.inference.points)
+        return batch | {"points": batch["dense_points"][:, :count]}
 
     def on_test_end(self) -> None:
         """Write metrics.json, metrics.csv and the picture of best, median and worst samples."""

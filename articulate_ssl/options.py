@@ -103,6 +103,8 @@ class InferenceOptions:
 
     Attributes:
         refine: Register the predicted shape to the cloud from the best hypotheses.
+        points: Most points of a cloud that registration reads and labels (a farthest-point prefix). Which way up a
+            closed laptop is shows in less than the spacing of the few points that suffice for the networks.
         candidates: Hypotheses that are refined; the best reconstruction wins.
         rounds: Rounds of registration.
         coarse_scale: First standard deviation of the correspondences, in normalised units.
@@ -110,6 +112,7 @@ class InferenceOptions:
     """
 
     refine: bool = True
+    points: int = 512
     candidates: int = 4
     rounds: int = 8
     coarse_scale: float = 0.05

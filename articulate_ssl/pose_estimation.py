@@ -102,10 +102,16 @@ class PoseEstimator:
         return register_articulated(template, joints, points, base, state, scales, rounds, not self.unidirectional)
 
     @torch.no_grad()
-    def predict(self, points: Tensor, refine: bool | None = None) -> Prediction:
-        """Predictions for normalised clouds [B, N, 3]; one cloud's does not depend on the rest of the batch.
+    def predict(
+        self,
+        points: Tensor,  # [B, N, 3] normalised, farthest-point order
+        num_points: int,
+        refine: bool | None = None,
+    ) -> Prediction:
+        """Predictions for whole clouds; one cloud's does not depend on the rest of the batch.
 
         Args:
+            num_points: The networks read this many leading points; registration reads all.
             refine: Register at test time, or not; None does what the options say.
 
         Raises:
@@ -114,12 +120,12 @@ class PoseEstimator:
         if not torch.isfinite(points).all():
             raise ValueError("a cloud has NaN or infinite points")
         with torch.autocast(points.device.type, enabled=False):
-            aligned, pose = self.align(points)
+            aligned, pose = self.align(points[:, :num_points])
             *_, (hypotheses, _) = self.iterate(aligned)
             posed = hypotheses.posed().flatten(2, 3)
             distance = hypothesis_distances(aligned, posed, bidirectional=not self.unidirectional)
             if self.inference.refine if refine is None else refine:
-                chosen = self._refine(hypotheses, aligned, distance)
+                chosen = self._refine(hypotheses, transform_points(invert_se3(pose), points), distance)
             else:
                 chosen = hypotheses.select(distance.argmin(dim=1))
             return self._prediction(chosen.at(pose[:, None] @ chosen.base, chosen.state), points)
@@ -134,20 +140,20 @@ class PoseEstimator:
         """Predict a scan of unknown scale: of several within the training clouds' range, the best reconstruction wins.
 
         Args:
-            num_points: That the networks read.
+            num_points: See `predict`; registration reads as many as the options say.
             radius: Mean and standard deviation, over normalised training clouds, of the points' mean distance to their
                 centre.
 
         Returns:
             The prediction (B = 1), centre [3] and scale of the normalisation, and the normalised points it labels.
         """
-        cloud, center, _ = normalise_cloud(points, num_points, scale=1.0)
+        cloud, center, _ = normalise_cloud(points, max(num_points, self.inference.points), scale=1.0)
         mean, spread = radius
         size = float(np.linalg.norm(np.asarray(points, dtype=np.float64) - center, axis=1).mean())
         scales = [size / (mean + shift * spread) for shift in SCALE_STARTS]
         device = self.articulated.template.device
         batch = torch.stack([torch.as_tensor(cloud / scale, dtype=torch.float32) for scale in scales]).to(device)
-        prediction = self.predict(batch, refine)
+        prediction = self.predict(batch, num_points, refine)
         extent = batch.norm(dim=-1).mean(dim=-1)
         best = int((prediction.reconstruction_error / extent).argmin())
         return prediction[best : best + 1], center, scales[best], batch[best].cpu().numpy()

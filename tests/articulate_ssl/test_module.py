@@ -152,6 +152,21 @@ def test_predictions_are_poses_parts_and_joints_in_the_space_of_the_points(train
     torch.testing.assert_close(moved, prediction.joint_pivot[:, 0], rtol=1e-3, atol=1e-4)
 
 
+def test_networks_read_the_leading_points_and_registration_reads_all(lively):
+    """What lies behind the training clouds' number of points changes labels' number and registration, nothing else."""
+    few = _clouds().to(lively.articulated.template)
+    lively.num_points = POINTS
+    whole = torch.cat([few, few.flip(0) + 0.1], dim=1)
+    alone, more = lively.predict_points(few, refine=False), lively.predict_points(whole, refine=False)
+    assert more.part_id.shape == (3, 2 * POINTS)
+    assert torch.equal(more.part_id[:, :POINTS], alone.part_id)
+    for name in ("part_pose", "joint_axis", "joint_pivot", "joint_state"):
+        assert torch.equal(getattr(more, name), getattr(alone, name)), name
+    assert not torch.equal(more.reconstruction_error, alone.reconstruction_error)
+    refined, from_more = lively.predict_points(few, refine=True), lively.predict_points(whole, refine=True)
+    assert not torch.allclose(refined.part_pose, from_more.part_pose, atol=1e-3)
+
+
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_clouds_that_are_not_finite_are_refused(trained, bad):
     clouds = _clouds()
@@ -262,7 +277,8 @@ def test_predicting_a_scan_of_any_unit_and_origin(trained):
     cloud = _clouds(1)[0].double().numpy()
     near, center, scale, points = trained[0].predict_cloud(cloud)
     far, far_center, far_scale, _ = trained[0].predict_cloud(1000 * cloud + [5e3, 0, -2e3])
-    assert points.shape == (POINTS, 3) and near.part_id.shape == (1, POINTS)
+    count = trained[0].inference.points  # a scan of fewer points repeats them
+    assert points.shape == (count, 3) and near.part_id.shape == (1, count)
     np.testing.assert_allclose(far_center, 1000 * center + [5e3, 0, -2e3])
     assert far_scale == pytest.approx(1000 * scale)
     _assert_same(replace(near, part_id=far.part_id), far, rtol=1e-2, atol=1e-2)
