@@ -37,7 +37,8 @@ from articulate_ssl.network.backbone import EquivariantBackbone
 from articulate_ssl.ops import chamfer, reference
 from articulate_ssl.ops.group_convolution import group_convolution
 from articulate_ssl.ops.kernel_points import symmetric_kernel_points
-from articulate_ssl.ops.neighborhood import build_neighborhood
+from articulate_ssl.ops.neighborhood import Neighborhood, build_neighborhood
+from articulate_ssl.ops.separable_group_convolution import separable_group_convolution
 from articulate_ssl.options import NetworkOptions
 from datamodules.benchmark import loader_samples_per_s
 
@@ -211,6 +212,9 @@ def operators(machine: Machine) -> list[Result]:
     results.append(Result("conv_fwd_bwd_ratio", "convolution 64 -> 128, forward + backward", ratios, "x"))
     results.append(Result(None, "  ours", seconds, "s"))
 
+    separable = EquivariantBackbone(separable=True).to(machine.device)
+    results += _separable(machine, separable, points, features, neighborhood)
+
     original = OriginalBackbone(backbone)
 
     def fast_backbone() -> Tensor:
@@ -238,6 +242,37 @@ def operators(machine: Machine) -> list[Result]:
     )
     results.append(Result("chamfer_fwd_bwd_ratio", "Chamfer 8 x 1024 x 1024, forward + backward", ratios, "x"))
     return results
+
+
+def _separable(
+    machine: Machine, backbone: EquivariantBackbone, points: Tensor, features: Tensor, neighborhood: Neighborhood
+) -> list[Result]:
+    """The separable layer 64 -> 128 against its twin, and a backbone of such layers."""
+    block = backbone.blocks[1]
+    arguments = (features, neighborhood, block.spatial, block.mixing, block.permutation)
+
+    def layer() -> Tensor:
+        with machine.autocast():
+            return separable_group_convolution(*arguments)
+
+    def forward() -> Tensor:
+        with machine.autocast():
+            return backbone(points)
+
+    twin = _forward_backward(lambda: reference.separable_group_convolution(*arguments))
+    ratios, seconds = _ratio(machine, twin, _forward_backward(layer), 5)
+    run = _forward_backward(forward)
+    memory = machine.peak_bytes(run)
+    whole = [machine.seconds(run) for _ in range(3)]
+    with torch.no_grad():
+        once = [machine.seconds(forward) for _ in range(3)]
+    return [
+        Result(None, "separable convolution 64 -> 128, forward + backward", ratios, "x"),
+        Result(None, "  ours", seconds, "s"),
+        Result(None, "separable backbone, forward", once, "s"),
+        Result(None, "  forward + backward", whole, "s"),
+        Result(None, "  peak memory", [memory / 1e9], "GB"),
+    ]
 
 
 def ceiling(machine: Machine, backbone_seconds: float) -> list[Result]:
@@ -352,8 +387,9 @@ def whole_network(machine: Machine) -> list[Result]:
     results = [Result("train_step_s_cpu_profile", label, [machine.seconds(step) for _ in range(7)], "s")]
 
     module = build_module(machine, NetworkOptions()).eval()
+    separable = build_module(machine, NetworkOptions(separable=True)).eval()
 
-    def infer(clouds: int) -> Callable[[], None]:
+    def infer(clouds: int, module: ArticulatedPoseModule = module) -> Callable[[], None]:
         points = _clouds(machine, clouds, 512)
         batches = points.split(clouds if on_gpu else TEST_BATCH)
 
@@ -371,6 +407,11 @@ def whole_network(machine: Machine) -> list[Result]:
         Result("inference_clouds_per_s_b1", "inference, paper size, batch 1", [1 / s for s in seconds], "/s")
     )
     results.append(Result(None, "  peak memory", [machine.peak_bytes(one) / 1e9], "GB"))
+    one = infer(1, separable)
+    one()
+    seconds = [machine.seconds(one) for _ in range(20 if on_gpu else 3)]
+    results.append(Result(None, "  separable", [1 / s for s in seconds], "/s"))
+    results.append(Result(None, "  separable, peak memory", [machine.peak_bytes(one) / 1e9], "GB"))
     if on_gpu:
         many()
     seconds = [machine.seconds(many) for _ in range(5 if on_gpu else 1)]

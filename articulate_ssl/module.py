@@ -127,7 +127,7 @@ class ArticulatedPoseModule(LightningModule):
     def _backbone(self) -> EquivariantBackbone:
         n = self.network_options
         return EquivariantBackbone(
-            n.group_order, n.dims, n.radii, n.num_neighbors, n.num_kernel_points, n.num_centers, n.intra
+            n.group_order, n.dims, n.radii, n.num_neighbors, n.num_kernel_points, n.num_centers, n.intra, n.separable
         )
 
     # Prediction

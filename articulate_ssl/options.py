@@ -21,6 +21,7 @@ class NetworkOptions:
         num_kernel_points: Kernel points, closed under the group.
         num_centers: Points each layer keeps (a farthest-point prefix); null keeps all, as the paper does.
         intra: Follow every convolution by one over the group, as EPN does.
+        separable: Depth-wise spatial kernels and a mixing of channels, not full kernels, in all layers but the first.
         head_dim: Channels of the SO(3)-PointNets and heads.
         shape_points: Points of each canonical part shape.
         flow_bound: Largest per-point displacement of an instance's shape from the category's.
@@ -38,6 +39,7 @@ class NetworkOptions:
     num_kernel_points: int = 24
     num_centers: list[int] | None = None
     intra: bool = False
+    separable: bool = False
     head_dim: int = 256
     shape_points: int = 128
     flow_bound: float = 0.1

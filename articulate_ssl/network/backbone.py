@@ -13,6 +13,7 @@ from articulate_ssl.ops.group_convolution import group_convolution
 from articulate_ssl.ops.kernel_points import KernelPoints, symmetric_kernel_points
 from articulate_ssl.ops.neighborhood import Neighborhood, Neighbors, correlate, nearest_neighbors
 from articulate_ssl.ops.normalization import layer_norm_leaky_relu
+from articulate_ssl.ops.separable_group_convolution import separable_group_convolution
 
 
 class IntraGroupConvolution(nn.Module):
@@ -38,21 +39,36 @@ class IntraGroupConvolution(nn.Module):
 
 
 class GroupConvolutionBlock(nn.Module):
-    """Group convolution -> normalisation -> LeakyReLU; with `intra`, EPN's separable block.
+    """Group convolution -> normalisation -> LeakyReLU; with `intra`, EPN's block.
 
-    The separable block adds an intra-group convolution and a skip connection, each with normalisation and LeakyReLU.
+    EPN's block adds an intra-group convolution and a skip connection, each with normalisation and LeakyReLU.
+    With `separable`, the spatial kernel is depth-wise and followed by a mixing of the channels. A block of one input
+    channel keeps the full kernel: it costs little, and depth-wise its features would be multiples of one number.
     Layer normalisation over the channels of each point and group element commutes with the action of the group and
     mixes neither points nor samples, so a cloud's features do not depend on the rest of its batch.
     """
 
     def __init__(
-        self, in_channels: int, out_channels: int, group: RotationGroup, kernel: KernelPoints, intra: bool
+        self,
+        in_channels: int,
+        out_channels: int,
+        group: RotationGroup,
+        kernel: KernelPoints,
+        intra: bool,
+        separable: bool = False,
     ) -> None:
         super().__init__()
         num_points = len(kernel.points)
-        self.weight = nn.Parameter(torch.empty(num_points, in_channels, out_channels))
+        self.separable = separable and in_channels > 1
         # Xavier for the fan-in of the whole kernel, with the gain of ReLU (as the original).
-        nn.init.normal_(self.weight, std=2 / (in_channels * num_points + out_channels) ** 0.5)
+        std = 2 / (in_channels * num_points + out_channels) ** 0.5
+        if self.separable:
+            # The product has the full kernel's scale; spatial kernels of unit norm leave the features' scale as it is.
+            self.spatial = nn.Parameter(torch.randn(num_points, in_channels) / num_points**0.5)
+            self.mixing = nn.Parameter(torch.randn(in_channels, out_channels) * std * num_points**0.5)
+        else:
+            self.weight = nn.Parameter(torch.empty(num_points, in_channels, out_channels))
+            nn.init.normal_(self.weight, std=std)
         self.norm = nn.LayerNorm(out_channels)
         self.register_buffer("permutation", kernel.permutation, persistent=False)
         self.intra = self.skip = None
@@ -67,13 +83,23 @@ class GroupConvolutionBlock(nn.Module):
         features: Tensor | None,  # [B, N, G, C], or None for the constant one
         neighborhood: Neighborhood,  # its M centres are the leading points
     ) -> Tensor:  # [B, M, G, C']
-        out = group_convolution(features, neighborhood, self.weight, self.permutation)
+        out = self.convolve(features, neighborhood)
         out = layer_norm_leaky_relu(out, self.norm.weight, self.norm.bias, 0.01, self.norm.eps)
         if self.intra is None:
             return out
         B, M, G, _ = out.shape
         center = out.new_ones(B, M, G, 1) if features is None else features[:, :M]
         return self.intra(out) + self.skip(center)
+
+    def convolve(
+        self,
+        features: Tensor | None,  # [B, N, G, C], or None for the constant one
+        neighborhood: Neighborhood,
+    ) -> Tensor:  # [B, M, G, C']
+        """The group convolution alone."""
+        if self.separable:
+            return separable_group_convolution(features, neighborhood, self.spatial, self.mixing, self.permutation)
+        return group_convolution(features, neighborhood, self.weight, self.permutation)
 
 
 class EquivariantBackbone(nn.Module):
@@ -87,7 +113,8 @@ class EquivariantBackbone(nn.Module):
         num_kernel_points: see `symmetric_kernel_points`.
         num_centers: for each layer, how many leading points remain (points come in farthest-point order, so a prefix
             covers the cloud); None keeps all of them everywhere.
-        intra: let the group's elements communicate in every layer (EPN's separable block).
+        intra: let the group's elements communicate in every layer (EPN's block).
+        separable: depth-wise spatial kernels followed by a mixing of channels, in every layer but the first.
 
     Raises:
         ValueError: if `dims`, `radii` and `num_centers` differ in length.
@@ -104,6 +131,7 @@ class EquivariantBackbone(nn.Module):
         num_kernel_points: int = 24,
         num_centers: Sequence[int] | None = None,
         intra: bool = False,
+        separable: bool = False,
     ) -> None:
         super().__init__()
         if len(radii) != len(dims) or (num_centers is not None and len(num_centers) != len(dims)):
@@ -118,7 +146,7 @@ class EquivariantBackbone(nn.Module):
         kernel = symmetric_kernel_points(self.group, num_kernel_points)
         self.register_buffer("kernel_points", kernel.points, persistent=False)
         self.blocks = nn.ModuleList(
-            GroupConvolutionBlock(c_in, c_out, self.group, kernel, intra)
+            GroupConvolutionBlock(c_in, c_out, self.group, kernel, intra, separable)
             for c_in, c_out in zip((1, *dims[:-1]), dims, strict=True)
         )
 

@@ -29,6 +29,17 @@ def group_convolution(
     return torch.einsum("bmgkc,kcd->bmgd", aggregate, weight)
 
 
+def separable_group_convolution(
+    features: Tensor,  # [B, N, G, C]
+    neighborhood: Neighborhood,
+    spatial: Tensor,  # [K, C]
+    mixing: Tensor,  # [C, C']
+    permutation: Tensor,  # [G, K]
+) -> Tensor:  # [B, M, G, C']
+    """Group convolution with the full kernel that a spatial kernel per channel and a mixing of channels amount to."""
+    return group_convolution(features, neighborhood, spatial[:, :, None] * mixing, permutation)
+
+
 def chamfer(
     points: Tensor,  # [*, N, 3]
     target: Tensor,  # [*, M, 3]

@@ -10,6 +10,7 @@ import yaml
 from synthetic import write_synthetic_set
 from tiny import NETWORK, POINTS, fit, tiny_module
 
+from articulate_ssl.checkpoint import load_module
 from articulate_ssl.cli import main
 
 
@@ -122,6 +123,16 @@ def test_a_test_writes_its_metrics(run, workplace):
     assert metrics["samples"] > 0 and metrics["failures"] == 0
     for name in ("protocol", "category", "source", "checkpoint", "seconds_per_cloud"):
         assert name in metrics
+
+
+def test_a_separable_network_trains_from_the_command_line(run, workplace):
+    command = ("fit", "-c", "laptop.yaml", "--model.recipe=paper", "--model.network.separable", "true")
+    assert run(*command, f"--trainer.default_root_dir={workplace / 'separable'}")[0] == 0
+    (checkpoint,) = (workplace / "separable").rglob("last.ckpt")
+    content = torch.load(checkpoint, weights_only=True)
+    assert content["global_step"] == 1
+    assert "articulated.backbone.blocks.1.spatial" in content["state_dict"]
+    assert load_module(checkpoint).network_options.separable
 
 
 def test_a_checkpoint_of_other_network_sizes_is_refused(run):

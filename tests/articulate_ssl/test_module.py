@@ -225,6 +225,7 @@ UNUSED_HEADS = {"base_head", "state_head", "axis_head"}
         {"recipe": "paper", "num_parts": 3, "joint_type": "prismatic", "state_range": 0.4},
         {"recipe": "paper", "num_parts": 4, "network": {"shared_axis": False, "pose_aware": False}},
         {"recipe": "paper", "network": {"part_features": False}},
+        {"recipe": "paper", "network": {"separable": True}},
         {"recipe": "paper", "objective": ObjectiveOptions(joint_regularization=0)},
         {"recipe": "paper", "objective": ObjectiveOptions(unidirectional=True)},
         {"joint_type": "prismatic", "state_range": 0.4},

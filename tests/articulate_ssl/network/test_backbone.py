@@ -4,7 +4,10 @@ import pytest
 import torch
 
 from articulate_ssl.equivariance import TOLERANCE, Permutation, Vector, assert_equivariant, off_group_residual
-from articulate_ssl.network.backbone import EquivariantBackbone
+from articulate_ssl.groups import rotation_group
+from articulate_ssl.network.backbone import EquivariantBackbone, GroupConvolutionBlock
+from articulate_ssl.ops.kernel_points import symmetric_kernel_points
+from articulate_ssl.ops.neighborhood import build_neighborhood
 
 
 def _backbone(**options):
@@ -15,10 +18,11 @@ def _backbone(**options):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("separable", [False, True])
 @pytest.mark.parametrize("intra", [False, True])
 @pytest.mark.parametrize("group_order", [12, 24, 60])
-def test_rotations_of_the_cloud_permute_the_group(group_order, intra, dtype):
-    backbone = _backbone(group_order=group_order, intra=intra, num_centers=(30, 20)).to(dtype)
+def test_rotations_of_the_cloud_permute_the_group(group_order, intra, separable, dtype):
+    backbone = _backbone(group_order=group_order, intra=intra, separable=separable, num_centers=(30, 20)).to(dtype)
     points = 0.5 * torch.rand(1, 40, 3, dtype=dtype)
     with torch.no_grad():
         assert_equivariant(backbone, (points,), backbone.group, [Vector()], Permutation())
@@ -33,9 +37,10 @@ def _with_places(backbone, points):
     return backbone(points) + points.mean(dim=-1)[..., None, None] * torch.linspace(0, 1, 40)[:, None, None]
 
 
+@pytest.mark.parametrize("separable", [False, True])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_translation_and_the_order_of_points_do_not_matter(dtype):
-    backbone = _backbone().to(dtype)
+def test_translation_and_the_order_of_points_do_not_matter(dtype, separable):
+    backbone = _backbone(separable=separable).to(dtype)
     points = 0.5 * torch.rand(2, 40, 3, dtype=dtype)
     order = torch.randperm(40)
     with torch.no_grad():
@@ -47,9 +52,10 @@ def test_translation_and_the_order_of_points_do_not_matter(dtype):
         assert _error(_with_places(backbone, points[:, order]), expected[:, order]) > 1e-2
 
 
+@pytest.mark.parametrize("separable", [False, True])
 @pytest.mark.parametrize("training", [True, False])
-def test_a_cloud_does_not_depend_on_the_rest_of_its_batch(training):
-    backbone = _backbone(intra=True).double().train(training)
+def test_a_cloud_does_not_depend_on_the_rest_of_its_batch(training, separable):
+    backbone = _backbone(intra=True, separable=separable).double().train(training)
     points = 0.5 * torch.rand(3, 40, 3, dtype=torch.float64)
     alone = torch.cat([backbone(cloud[None]) for cloud in points])
     torch.testing.assert_close(backbone(points), alone, rtol=1e-12, atol=1e-12)
@@ -67,11 +73,30 @@ def test_centres_are_the_leading_points():
     assert backbone(points[:, :15]).shape == (2, 15, 12, 6)
 
 
-def test_every_parameter_gets_a_gradient():
-    backbone = _backbone(intra=True)
+@pytest.mark.parametrize("separable", [False, True])
+def test_every_parameter_gets_a_gradient(separable):
+    backbone = _backbone(intra=True, separable=separable)
     backbone(0.5 * torch.rand(2, 40, 3)).square().sum().backward()
     for name, parameter in backbone.named_parameters():
         assert parameter.grad.abs().max() > 0, name
+
+
+def test_a_separable_backbone_keeps_the_first_kernel_full():
+    first, second = _backbone(separable=True).blocks
+    assert first.weight.shape == (24, 1, 4)
+    assert {n: p.shape for n, p in second.named_parameters(recurse=False)} == {"spatial": (24, 4), "mixing": (4, 6)}
+
+
+def test_a_separable_layer_starts_at_the_scale_of_a_full_one():
+    torch.manual_seed(0)
+    group = rotation_group(12)
+    kernel = symmetric_kernel_points(group)
+    neighborhood = build_neighborhood(0.5 * torch.rand(1, 60, 3), 0.2, kernel.points, 16)
+    features = torch.randn(1, 60, 12, 128)
+    full, separable = (GroupConvolutionBlock(128, 256, group, kernel, False, option) for option in (False, True))
+    with torch.no_grad():
+        ratio = separable.convolve(features, neighborhood).std() / full.convolve(features, neighborhood).std()
+    assert ratio == pytest.approx(1, abs=0.1)
 
 
 def test_layers_state_one_value_each():

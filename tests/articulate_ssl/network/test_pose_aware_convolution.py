@@ -106,10 +106,10 @@ def test_a_part_that_moves_turns_its_own_features_and_no_others(order):
     assert error(blind) > 1e-2
 
 
-@pytest.fixture
-def backbone():
+@pytest.fixture(params=[False, True], ids=["full", "separable"])
+def backbone(request):
     torch.manual_seed(0)
-    return EquivariantBackbone(12, (4, 6), (0.2, 0.3), num_neighbors=10)
+    return EquivariantBackbone(12, (4, 6), (0.2, 0.3), num_neighbors=10, separable=request.param)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

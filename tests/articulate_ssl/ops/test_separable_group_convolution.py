@@ -1,0 +1,147 @@
+"""The fast separable group convolution against its readable twin: values, gradients and equivariance."""
+
+import pytest
+import torch
+
+from articulate_ssl.equivariance import Permutation, Vector, assert_equivariant
+from articulate_ssl.groups import rotation_group
+from articulate_ssl.ops import reference
+from articulate_ssl.ops.kernel_points import symmetric_kernel_points
+from articulate_ssl.ops.neighborhood import build_neighborhood
+from articulate_ssl.ops.separable_group_convolution import _TILE_ELEMENTS, _WIDTH, separable_group_convolution
+
+TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-9}
+
+
+def _problem(order=12, dtype=torch.float64, num_points=40, num_centers=20, channels=(5, 7)):
+    generator = torch.Generator().manual_seed(0)
+    group = rotation_group(order)
+    kernel = symmetric_kernel_points(group)
+    points = 0.3 * torch.rand(2, num_points, 3, dtype=dtype, generator=generator)
+    features, spatial, mixing = (
+        torch.randn(*shape, dtype=dtype, generator=generator, requires_grad=True)
+        for shape in ((2, num_points, order, channels[0]), (24, channels[0]), channels)
+    )
+    centers = torch.arange(num_centers).expand(2, -1)
+    return group, kernel, points, features, spatial, mixing, centers
+
+
+def _relative(a, b):
+    return ((a - b).norm() / b.norm()).item()
+
+
+def _assert_equal_to_reference(inputs, neighborhood, permutation, tolerance):
+    features, spatial, mixing = inputs
+    results = []
+    for function in (separable_group_convolution, reference.separable_group_convolution):
+        out = function(features, neighborhood, spatial, mixing, permutation)
+        direction = torch.linspace(-1, 1, out.numel(), dtype=out.dtype).view_as(out)
+        results.append((out, *torch.autograd.grad(out, inputs, direction)))
+    for fast, slow in zip(*results, strict=True):
+        assert _relative(fast, slow) < tolerance
+
+
+@pytest.mark.parametrize("dtype", TOLERANCE)
+@pytest.mark.parametrize("order", [12, 24, 60])
+def test_values_and_gradients_equal_the_reference(order, dtype):
+    _, kernel, points, *inputs, centers = _problem(order, dtype)
+    neighborhood = build_neighborhood(points, 0.2, kernel.points, 16, centers)
+    _assert_equal_to_reference(inputs, neighborhood, kernel.permutation, TOLERANCE[dtype])
+
+
+@pytest.mark.parametrize(("width", "budget"), [(1, 1), (5 * 5, 1000), (5 * 12, 10**6)])
+def test_the_tiling_does_not_change_the_result(monkeypatch, width, budget):
+    monkeypatch.setitem(_WIDTH, "cpu", width)
+    monkeypatch.setitem(_TILE_ELEMENTS, "cpu", budget)
+    _, kernel, points, *inputs, centers = _problem()
+    neighborhood = build_neighborhood(points, 0.2, kernel.points, 16, centers)
+    _assert_equal_to_reference(inputs, neighborhood, kernel.permutation, 1e-9)
+
+
+@pytest.mark.parametrize(
+    "points",
+    [torch.zeros(1, 1, 3), torch.zeros(1, 6, 3), torch.eye(3)[None] * 10],
+    ids=["one point", "coincident points", "no neighbours"],
+)
+def test_degenerate_clouds(points):
+    kernel = symmetric_kernel_points(rotation_group(12))
+    neighborhood = build_neighborhood(points.double(), 0.2, kernel.points, 4)
+    _, _, _, *inputs, _ = _problem(num_points=points.shape[1])
+    inputs[0] = inputs[0].detach()[:1].requires_grad_()
+    _assert_equal_to_reference(inputs, neighborhood, kernel.permutation, 1e-9)
+
+
+def test_points_that_no_centre_sees_get_no_gradient():
+    _, kernel, points, *inputs, centers = _problem(num_centers=2)
+    neighborhood = build_neighborhood(points, 0.2, kernel.points, 4, centers)
+    assert len(neighborhood.index[0].unique()) < 10
+    _assert_equal_to_reference(inputs, neighborhood, kernel.permutation, 1e-9)
+
+
+def test_the_neighborhood_limits_what_a_centre_sees():
+    _, kernel, points, features, spatial, mixing, _ = _problem()
+    neighborhood = build_neighborhood(points, 0.1, kernel.points, 40)
+    out = separable_group_convolution(features, neighborhood, spatial, mixing, kernel.permutation)
+    (gradient,) = torch.autograd.grad(out[:, 0].sum(), features)
+    seen = gradient.abs().amax(dim=(2, 3)) > 0
+    assert torch.equal(seen, (points - points[:, :1]).norm(dim=-1) <= 0.1)
+
+
+def test_gradcheck():
+    _, kernel, points, *inputs, centers = _problem(num_points=5, num_centers=3, channels=(2, 3))
+    neighborhood = build_neighborhood(points, 0.3, kernel.points, 4, centers)
+    assert torch.autograd.gradcheck(
+        lambda f, s, m: separable_group_convolution(f, neighborhood, s, m, kernel.permutation), inputs, fast_mode=True
+    )
+
+
+def test_non_contiguous_features_and_gradients():
+    _, kernel, points, features, spatial, mixing, centers = _problem()
+    neighborhood = build_neighborhood(points, 0.2, kernel.points, 16, centers)
+    strided = features.detach().transpose(2, 3).contiguous().transpose(2, 3).requires_grad_()
+    _assert_equal_to_reference((strided, spatial, mixing), neighborhood, kernel.permutation, 1e-9)
+
+
+@pytest.mark.parametrize("dtype", TOLERANCE)
+@pytest.mark.parametrize("order", [12, 24, 60])
+def test_rotating_the_cloud_permutes_the_group(order, dtype):
+    group, kernel, points, features, spatial, mixing, centers = _problem(order, dtype)
+
+    def layer(points, features):
+        neighborhood = build_neighborhood(points, 0.2, kernel.points, 16, centers)
+        return separable_group_convolution(features, neighborhood, spatial, mixing, kernel.permutation)
+
+    with torch.no_grad():
+        assert_equivariant(layer, (points, features), group, [Vector(), Permutation()], Permutation())
+
+
+@pytest.mark.parametrize("broken", ["kernel", "permutation"])
+def test_a_broken_layer_is_caught(broken):
+    group, kernel, points, features, spatial, mixing, centers = _problem(60)
+    kernel_points, permutation = kernel
+    if broken == "kernel":
+        kernel_points = kernel_points + 0.05 * torch.randn_like(kernel_points)
+    else:
+        permutation = permutation[group.inverse]
+
+    def layer(points, features):
+        neighborhood = build_neighborhood(points, 0.2, kernel_points, 16, centers)
+        return separable_group_convolution(features, neighborhood, spatial, mixing, permutation)
+
+    with torch.no_grad(), pytest.raises(AssertionError, match="not equivariant"):
+        assert_equivariant(layer, (points, features), group, [Vector(), Permutation()], Permutation())
+
+
+def test_bfloat16_is_accurate_to_a_percent(monkeypatch):
+    monkeypatch.setattr("articulate_ssl.ops.separable_group_convolution.fast_dtype", lambda device: torch.bfloat16)
+    _, kernel, points, *inputs, centers = _problem(60, torch.float32, channels=(16, 16))
+    features, spatial, mixing = inputs
+    neighborhood = build_neighborhood(points, 0.2, kernel.points, 16, centers)
+    exact = separable_group_convolution(features, neighborhood, spatial, mixing, kernel.permutation)
+    with torch.autocast("cpu", torch.bfloat16):
+        rounded = separable_group_convolution(features, neighborhood, spatial, mixing, kernel.permutation)
+    assert rounded.dtype == torch.bfloat16
+    gradients = [torch.autograd.grad(out, inputs, torch.ones_like(out)) for out in (exact, rounded)]
+    assert _relative(rounded.float(), exact) < 1e-2
+    for a, b in zip(*gradients, strict=True):
+        assert _relative(b, a) < 1e-2
