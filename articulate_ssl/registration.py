@@ -22,8 +22,12 @@ _BATCH_ENTRIES = 2**22  # entries of one responsibility matrix
 # What turns a part about an axis by so little (a thin rod about its length) is noise: such a rotation stays as it was.
 _INERTIA = 0.02
 
-# Points, correspondence scales, rounds and survivors of each stage of a search.
-_HALVING = ((48, (0.14, 0.10), 2, 24), (96, (0.10, 0.04), 5, 4), (256, (0.05, 0.02), 12, 4))
+# Of each stage of a search: points, correspondence scales, rounds, survivors, and whether those are to be different.
+_HALVING = (
+    (48, (0.14, 0.10), 2, 24, False),
+    (96, (0.10, 0.04), 5, 4, True),
+    (256, (0.05, 0.02), 12, 4, True),
+)
 _SAME = 0.5  # radians: orientations closer than this are one hypothesis
 
 
@@ -224,17 +228,15 @@ def search_articulated(
     base = se3(rotations[None, :, None].expand(len(clouds), -1, len(states), -1, -1), shift).flatten(1, 2)
     state = states.repeat(len(rotations), 1).expand(len(clouds), -1, -1)
     rows = torch.arange(len(clouds), device=clouds.device)[:, None]
-    for num_points, scales, rounds, survivors in _HALVING:
+    for num_points, scales, rounds, survivors, different in _HALVING:
         count = base.shape[1]
         copies = clouds[:, :num_points].repeat_interleave(count, dim=0)
         flat = register_articulated(
             template.thinned(num_points), joints, copies, base.flatten(0, 1), state.flatten(0, 1), scales, rounds
         )
         base, state, error = (value.unflatten(0, (len(clouds), count)) for value in flat)
-        if survivors > 4:
-            best = error.topk(min(survivors, count), largest=False).indices
-        else:
-            best = _different(base, error, min(survivors, count))
+        survivors = min(survivors, count)
+        best = _different(base, error, survivors) if different else error.topk(survivors, largest=False).indices
         base, state, error = base[rows, best], state[rows, best], error[rows, best]
     posed = template.posed(joints.part_pose(base.flatten(0, 1), state.flatten(0, 1)))
     error = chamfer_l1(clouds.repeat_interleave(base.shape[1], dim=0), posed).unflatten(0, (len(clouds), -1))

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from twins import TOLERANCE, assert_same_as_twin, relative_error
 
 from articulate_ssl.equivariance import Permutation, Vector, assert_equivariant
 from articulate_ssl.groups import rotation_group
@@ -9,8 +10,6 @@ from articulate_ssl.ops import reference
 from articulate_ssl.ops.kernel_points import symmetric_kernel_points
 from articulate_ssl.ops.neighborhood import build_neighborhood
 from articulate_ssl.ops.separable_group_convolution import _TILE_ELEMENTS, _WIDTH, separable_group_convolution
-
-TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-9}
 
 
 def _problem(order=12, dtype=torch.float64, num_points=40, num_centers=20, channels=(5, 7)):
@@ -26,19 +25,15 @@ def _problem(order=12, dtype=torch.float64, num_points=40, num_centers=20, chann
     return group, kernel, points, features, spatial, mixing, centers
 
 
-def _relative(a, b):
-    return ((a - b).norm() / b.norm()).item()
-
-
 def _assert_equal_to_reference(inputs, neighborhood, permutation, tolerance):
     features, spatial, mixing = inputs
-    results = []
-    for function in (separable_group_convolution, reference.separable_group_convolution):
-        out = function(features, neighborhood, spatial, mixing, permutation)
-        direction = torch.linspace(-1, 1, out.numel(), dtype=out.dtype).view_as(out)
-        results.append((out, *torch.autograd.grad(out, inputs, direction)))
-    for fast, slow in zip(*results, strict=True):
-        assert _relative(fast, slow) < tolerance
+    arguments = (features, neighborhood, spatial, mixing, permutation)
+    assert_same_as_twin(
+        lambda: separable_group_convolution(*arguments),
+        lambda: reference.separable_group_convolution(*arguments),
+        inputs,
+        tolerance,
+    )
 
 
 @pytest.mark.parametrize("dtype", TOLERANCE)
@@ -142,6 +137,6 @@ def test_bfloat16_is_accurate_to_a_percent(monkeypatch):
         rounded = separable_group_convolution(features, neighborhood, spatial, mixing, kernel.permutation)
     assert rounded.dtype == torch.bfloat16
     gradients = [torch.autograd.grad(out, inputs, torch.ones_like(out)) for out in (exact, rounded)]
-    assert _relative(rounded.float(), exact) < 1e-2
+    assert relative_error(rounded.float(), exact) < 1e-2
     for a, b in zip(*gradients, strict=True):
-        assert _relative(b, a) < 1e-2
+        assert relative_error(b, a) < 1e-2

@@ -66,5 +66,6 @@ def test_how_a_rod_is_turned_about_its_length_does_not_matter():
 def test_what_is_no_joint_leaves_a_gap():
     generator = torch.Generator().manual_seed(2)
     points = 0.3 * torch.randn(64, 3, generator=generator)
-    free = se3(roma.random_rotmat(41), 0.3 * torch.randn(41, 3, generator=generator))
+    rotation = roma.unitquat_to_rotmat(normalize(torch.randn(41, 4, generator=generator), dim=-1))
+    free = se3(rotation, 0.3 * torch.randn(41, 3, generator=generator))
     assert fit_screw(free, points, REVOLUTE).gap.median() > 0.1
