@@ -20,10 +20,17 @@ TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}  # relative to the norm o
 
 @dataclass(frozen=True)
 class Permutation:
-    """Features [..., G, C] of a left action: rotation by element a moves the feature at g to `product[a, g]`."""
+    """Features [..., G, C] of a left action: rotation by element a moves the feature at g to `product[a, g]`.
+
+    Attributes:
+        action: [G, V] for features [..., V, C] on something else that the group permutes (`Directions.action`).
+    """
+
+    action: Tensor | None = None
 
     def __call__(self, value: Tensor, group: RotationGroup, element: int) -> Tensor:
-        index = group.product[group.inverse[element]].to(value.device)  # the feature at h comes from a^{-1} h
+        table = group.product if self.action is None else self.action
+        index = table[group.inverse[element]].to(value.device)  # the feature at h comes from a^{-1} h
         return value.index_select(-2, index)
 
 

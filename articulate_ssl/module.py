@@ -106,10 +106,16 @@ class ArticulatedPoseModule(LightningModule):
             stretch_bound=network.stretch_bound,
             part_features=network.part_features,
             shared_axis=network.shared_axis,
+            directions=network.directions,
         )
         self.rigid = (
             RigidAlignment(
-                self._backbone(), group, network.dims[-1], network.head_dim, num_parts * network.shape_points
+                self._backbone(),
+                group,
+                network.dims[-1],
+                network.head_dim,
+                num_parts * network.shape_points,
+                directions=network.directions,
             )
             if schedule.rigid_steps
             else None
@@ -127,7 +133,15 @@ class ArticulatedPoseModule(LightningModule):
     def _backbone(self) -> EquivariantBackbone:
         n = self.network_options
         return EquivariantBackbone(
-            n.group_order, n.dims, n.radii, n.num_neighbors, n.num_kernel_points, n.num_centers, n.intra, n.separable
+            n.group_order,
+            n.dims,
+            n.radii,
+            n.num_neighbors,
+            n.num_kernel_points,
+            n.num_centers,
+            intra=n.intra,
+            separable=n.separable,
+            directions=n.directions,
         )
 
     # Prediction

@@ -22,6 +22,8 @@ class NetworkOptions:
         num_centers: Points each layer keeps (a farthest-point prefix); null keeps all, as the paper does.
         intra: Follow every convolution by one over the group, as EPN does.
         separable: Depth-wise spatial kernels and a mixing of channels, not full kernels, in all layers but the first.
+        directions: Features on the 12 directions of the icosahedron (E2PN) instead of the 60 rotations of its group,
+            with separable kernels; part features are read as functions of the rotations again. Needs group_order 60.
         head_dim: Channels of the SO(3)-PointNets and heads.
         shape_points: Points of each canonical part shape.
         flow_bound: Largest per-point displacement of an instance's shape from the category's.
@@ -40,6 +42,7 @@ class NetworkOptions:
     num_centers: list[int] | None = None
     intra: bool = False
     separable: bool = False
+    directions: bool = False
     head_dim: int = 256
     shape_points: int = 128
     flow_bound: float = 0.1

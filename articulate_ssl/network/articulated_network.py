@@ -18,7 +18,7 @@ from torch.nn import functional
 from articulate_ssl.groups import RotationGroup
 from articulate_ssl.kinematic_chain import KinematicChain, extract_chain, pair_index
 from articulate_ssl.network.slot_attention import SlotAttention
-from articulate_ssl.network.so3_pointnet import GroupAttentionPooling, SO3PointNet
+from articulate_ssl.network.so3_pointnet import GroupAttentionPooling, part_pointnet
 from datamodules.geometry import PRISMATIC, REVOLUTE, invert_se3, screw_motion, se3
 
 
@@ -127,6 +127,7 @@ class ArticulatedNetwork(nn.Module):
         stretch_bound: float = 0.3,
         part_features: bool = True,
         shared_axis: bool = False,
+        directions: bool = False,
     ) -> None:
         """Args: see the configuration of `ArticulatedPoseModule`, which builds this network."""
         super().__init__()
@@ -144,7 +145,7 @@ class ArticulatedNetwork(nn.Module):
         self.backbone = backbone
         self.point_pool = GroupAttentionPooling(in_dim)
         self.part_proposal = SlotAttention(in_dim, num_parts)
-        self.pointnet = SO3PointNet(in_dim, dim, elements)
+        self.pointnet = part_pointnet(in_dim, dim, group, directions)
         self.part_pool = GroupAttentionPooling(2 * dim)
 
         def head(inputs: int, outputs: int) -> nn.Sequential:

@@ -7,8 +7,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from articulate_ssl.directions import Directions, icosahedron_directions, kernel_orbits, kernel_rings
 from articulate_ssl.groups import RotationGroup, rotation_group
 from articulate_ssl.network.pose_aware_convolution import canonicalize
+from articulate_ssl.ops.direction_convolution import constant_direction_convolution, direction_convolution
 from articulate_ssl.ops.group_convolution import group_convolution
 from articulate_ssl.ops.kernel_points import KernelPoints, symmetric_kernel_points
 from articulate_ssl.ops.neighborhood import Neighborhood, Neighbors, correlate, nearest_neighbors
@@ -102,6 +104,36 @@ class GroupConvolutionBlock(nn.Module):
         return group_convolution(features, neighborhood, self.weight, self.permutation)
 
 
+class DirectionConvolutionBlock(nn.Module):
+    """Direction convolution -> normalisation -> LeakyReLU. The one input channel of a first block is constant."""
+
+    def __init__(self, in_channels: int, out_channels: int, directions: Directions, kernel: KernelPoints) -> None:
+        super().__init__()
+        num_points = len(kernel.points)
+        # Scales as in `GroupConvolutionBlock`.
+        std = 2 / (in_channels * num_points + out_channels) ** 0.5
+        orbit = kernel_rings(directions, kernel) if in_channels == 1 else kernel_orbits(directions, kernel)
+        num_orbits = int(orbit.max()) + 1
+        if in_channels == 1:
+            self.weight = nn.Parameter(torch.randn(num_orbits, out_channels) * std)
+        else:
+            self.spatial = nn.Parameter(torch.randn(num_orbits, in_channels) / orbit[0].numel() ** 0.5)
+            self.mixing = nn.Parameter(torch.randn(in_channels, out_channels) * std * num_points**0.5)
+        self.norm = nn.LayerNorm(out_channels)
+        self.register_buffer("orbit", orbit, persistent=False)
+
+    def forward(
+        self,
+        features: Tensor | None,  # [B, N, V, C], or None for the constant one
+        neighborhood: Neighborhood,  # its M centres are the leading points
+    ) -> Tensor:  # [B, M, V, C']
+        if features is None:
+            out = constant_direction_convolution(neighborhood, self.weight, self.orbit)
+        else:
+            out = direction_convolution(features, neighborhood, self.spatial, self.mixing, self.orbit)
+        return layer_norm_leaky_relu(out, self.norm.weight, self.norm.bias, 0.01, self.norm.eps)
+
+
 class EquivariantBackbone(nn.Module):
     """Features of every point and group element, equivariant under the group and invariant to translation.
 
@@ -115,9 +147,12 @@ class EquivariantBackbone(nn.Module):
             covers the cloud); None keeps all of them everywhere.
         intra: let the group's elements communicate in every layer (EPN's block).
         separable: depth-wise spatial kernels followed by a mixing of channels, in every layer but the first.
+        directions: features on the 12 directions of the icosahedron instead of the 60 rotations of its group, with
+            kernels that are separable; the third axis of the result counts directions.
 
     Raises:
-        ValueError: if `dims`, `radii` and `num_centers` differ in length.
+        ValueError: if `dims`, `radii` and `num_centers` differ in length, or `directions` are asked for with another
+            group than the icosahedral one, or with `intra`, which is a convolution over the group.
     """
 
     group: RotationGroup
@@ -132,6 +167,7 @@ class EquivariantBackbone(nn.Module):
         num_centers: Sequence[int] | None = None,
         intra: bool = False,
         separable: bool = False,
+        directions: bool = False,
     ) -> None:
         super().__init__()
         if len(radii) != len(dims) or (num_centers is not None and len(num_centers) != len(dims)):
@@ -145,10 +181,16 @@ class EquivariantBackbone(nn.Module):
         self.out_channels = dims[-1]
         kernel = symmetric_kernel_points(self.group, num_kernel_points)
         self.register_buffer("kernel_points", kernel.points, persistent=False)
-        self.blocks = nn.ModuleList(
-            GroupConvolutionBlock(c_in, c_out, self.group, kernel, intra, separable)
-            for c_in, c_out in zip((1, *dims[:-1]), dims, strict=True)
-        )
+        if directions and intra:
+            raise ValueError("intra is a convolution over the group: features on directions have no use for it")
+        channels = list(zip((1, *dims[:-1]), dims, strict=True))
+        if directions:
+            table = icosahedron_directions(self.group)
+            self.blocks = nn.ModuleList(DirectionConvolutionBlock(*c, table, kernel) for c in channels)
+        else:
+            self.blocks = nn.ModuleList(
+                GroupConvolutionBlock(*c, self.group, kernel, intra, separable) for c in channels
+            )
 
     def neighborhoods(
         self,
@@ -172,7 +214,7 @@ class EquivariantBackbone(nn.Module):
         self,
         points: Tensor,  # [B, N, 3]
         poses: Tensor | None = None,  # [B, N, 4, 4] canonical -> camera space, of each point's part
-    ) -> Tensor:  # [B, M, G, C]
+    ) -> Tensor:  # [B, M, G, C], or [B, M, V, C] on directions
         """Features in the frame of `points`, or with `poses` pose-aware features in the canonical frame.
 
         Pose-aware convolution is plain convolution of the cloud with every part moved back to canonical space

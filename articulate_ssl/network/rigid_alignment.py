@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from articulate_ssl.groups import RotationGroup
-from articulate_ssl.network.so3_pointnet import GroupAttentionPooling, SO3PointNet
+from articulate_ssl.network.so3_pointnet import GroupAttentionPooling, part_pointnet
 
 
 class RigidHypotheses(NamedTuple):
@@ -40,13 +40,14 @@ class RigidAlignment(nn.Module):
         dim: int,
         shape_points: int,
         flow_bound: float = 0.05,
+        directions: bool = False,
     ) -> None:
         """Args: backbone with `in_dim` output channels; hidden width; points of the canonical shape; flow bound."""
         super().__init__()
         elements = group.elements
         self.register_buffer("elements", elements, persistent=False)
         self.backbone = backbone
-        self.pointnet = SO3PointNet(in_dim, dim, elements)
+        self.pointnet = part_pointnet(in_dim, dim, group, directions)
         self.pool = GroupAttentionPooling(dim)
         self.pose_head = nn.Sequential(nn.Linear(dim, dim), nn.LeakyReLU(0.1), nn.Linear(dim, 6))
         self.flow_head = nn.Sequential(nn.Linear(dim, dim), nn.LeakyReLU(0.1), nn.Linear(dim, 3 * shape_points))

@@ -5,9 +5,16 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from articulate_ssl.directions import Directions, icosahedron_directions
+from articulate_ssl.groups import RotationGroup
 from articulate_ssl.ops.normalization import layer_norm_leaky_relu
 
 _SLOPE = 0.1
+
+
+def _perceptron(in_dim: int, out_dim: int) -> nn.Sequential:
+    layers = nn.Linear(in_dim, out_dim), nn.LayerNorm(out_dim), nn.LeakyReLU(_SLOPE)
+    return nn.Sequential(*layers, nn.Linear(out_dim, out_dim), nn.ReLU())
 
 
 class SO3PointNet(nn.Module):
@@ -21,13 +28,7 @@ class SO3PointNet(nn.Module):
         """Args: input and output channels; `elements` [G, 3, 3], the group's rotation matrices."""
         super().__init__()
         self.register_buffer("elements", elements, persistent=False)
-        self.perceptron = nn.Sequential(
-            nn.Linear(in_dim + 3, out_dim),
-            nn.LayerNorm(out_dim),
-            nn.LeakyReLU(_SLOPE),
-            nn.Linear(out_dim, out_dim),
-            nn.ReLU(),
-        )
+        self.perceptron = _perceptron(in_dim + 3, out_dim)
 
     def forward(
         self,
@@ -48,6 +49,41 @@ class SO3PointNet(nn.Module):
         return largest_product(hidden.flatten(2), association).relu().unflatten(2, (features.shape[2], -1))
 
 
+class DirectionPointNet(nn.Module):
+    """An `SO3PointNet` of features on directions: parts are pooled per direction, then read as functions of rotations.
+
+    Group element g orders the directions as g v_1, ..., g v_12. The pooled features in this order determine the feature
+    at g, as in E2PN's permutation layer. Of a point, direction v sees how far along v it is, and how far away: what is
+    left of its coordinates by the rotations that leave v where it is.
+    """
+
+    def __init__(self, in_dim: int, out_dim: int, directions: Directions) -> None:
+        """Args: input and output channels; the directions of the input."""
+        super().__init__()
+        self.register_buffer("vectors", directions.vectors, persistent=False)
+        self.register_buffer("order", directions.action.T.contiguous(), persistent=False)
+        self.perceptron = _perceptron(in_dim + 2, out_dim)
+        fan_in = len(directions.vectors) * out_dim
+        self.to_group = nn.Parameter(torch.randn(len(directions.vectors), out_dim, out_dim) * (2 / fan_in) ** 0.5)
+        self.norm = nn.LayerNorm(out_dim)
+
+    def forward(
+        self,
+        features: Tensor,  # [B, M, V, C]
+        points: Tensor,  # [B, M, 3], in the frame the features were computed in
+        association: Tensor,  # [B, M, K], how much each point belongs to each part
+    ) -> Tensor:  # [B, K, G, C']
+        """Pool points into parts as `SO3PointNet` does, and order the directions."""
+        along = points @ self.vectors.to(points).T  # [B, M, V]
+        away = points.norm(dim=-1, keepdim=True).expand_as(along)
+        first, norm, _, last, _ = self.perceptron
+        hidden = first(torch.cat([features, torch.stack([along, away], dim=-1)], dim=-1))
+        hidden = layer_norm_leaky_relu(hidden, norm.weight, norm.bias, _SLOPE, norm.eps)
+        pooled = largest_product(last(hidden).flatten(2), association).relu().unflatten(2, (features.shape[2], -1))
+        ordered = sum((pooled @ w).index_select(2, i) for w, i in zip(self.to_group, self.order, strict=True))
+        return layer_norm_leaky_relu(ordered, self.norm.weight, self.norm.bias, _SLOPE, self.norm.eps)
+
+
 def largest_product(
     features: Tensor,  # [B, M, D]
     weight: Tensor,  # [B, M, K]
@@ -56,6 +92,13 @@ def largest_product(
     with torch.no_grad():
         index = torch.stack([(features * w[..., None]).max(dim=1).indices for w in weight.unbind(-1)], dim=1)
     return features.gather(1, index) * weight.transpose(1, 2).gather(2, index)
+
+
+def part_pointnet(in_dim: int, out_dim: int, group: RotationGroup, directions: bool) -> SO3PointNet | DirectionPointNet:
+    """The PointNet that reads a backbone's features, on directions or on the group."""
+    if directions:
+        return DirectionPointNet(in_dim, out_dim, icosahedron_directions(group))
+    return SO3PointNet(in_dim, out_dim, group.elements)
 
 
 class GroupAttentionPooling(nn.Module):

@@ -40,6 +40,20 @@ def separable_group_convolution(
     return group_convolution(features, neighborhood, spatial[:, :, None] * mixing, permutation)
 
 
+def direction_convolution(
+    features: Tensor,  # [B, N, V, C]
+    neighborhood: Neighborhood,
+    spatial: Tensor,  # [O, C]
+    mixing: Tensor,  # [C, C']
+    orbit: Tensor,  # [V, K, V]
+) -> Tensor:  # [B, M, V, C']
+    """Direction convolution with the kernel written out for every triple, in plain autograd."""
+    sample = torch.arange(len(features), device=features.device)[:, None, None]
+    grouped = features[sample, neighborhood.index]  # [B, M, n, V, C]
+    aggregate = torch.einsum("bmnk,bmnuc->bmkuc", neighborhood.weight, grouped)
+    return torch.einsum("bmkuc,vkuc->bmvc", aggregate, spatial[orbit]) @ mixing
+
+
 def chamfer(
     points: Tensor,  # [*, N, 3]
     target: Tensor,  # [*, M, 3]

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.nn.functional import pad
 
+from articulate_ssl.ops.edges import Edges
 from articulate_ssl.ops.neighborhood import Neighborhood
 from articulate_ssl.ops.precision import fast_dtype
 
@@ -16,7 +16,6 @@ from articulate_ssl.ops.precision import fast_dtype
 # stay in the L2 cache and in buffers that every tile uses again; on a GPU each tile fills the machine.
 _WIDTH = {"cpu": 256, "cuda": 2**20}
 _TILE_ELEMENTS = {"cpu": 2**17, "cuda": 2**26}
-_PADDING = 4  # edges of a target are padded to a multiple of this, so that few lengths occur
 
 
 def separable_group_convolution(
@@ -46,7 +45,7 @@ class _DepthwiseConvolution(torch.autograd.Function):
         ctx.save_for_backward(features, weight, index, correlation, permutation)
         out = features.new_empty(*index.shape[:2], *features.shape[2:])
         slot = permutation.argsort(dim=1)
-        edges = _Edges(features, index, correlation)
+        edges = _edges(features, index, correlation)
         for elements, block in _blocks(features):
             kernel = weight[slot[elements].T].flatten(1)  # [K, s C]
             filtered = block.new_empty(len(edges.order), block.shape[1])
@@ -63,7 +62,7 @@ class _DepthwiseConvolution(torch.autograd.Function):
         grad_weight = torch.zeros_like(weight, dtype=torch.promote_types(weight.dtype, torch.float32))
         slot = permutation.argsort(dim=1)
         # The transpose of a depth-wise convolution is one along reversed edges; its aggregate gives both gradients.
-        edges = _Edges(features, index, correlation, reverse=True)
+        edges = _edges(features, index, correlation, reverse=True)
         for (elements, block), (_, grad) in zip(_blocks(features), _blocks(grad_out), strict=True):
             kernel = weight[slot[elements].T].flatten(1)
             grad_kernel = torch.zeros_like(kernel, dtype=grad_weight.dtype)
@@ -90,58 +89,8 @@ def _elements_per_block(features: Tensor) -> int:
     return min(G, max(1, _WIDTH[features.device.type] // C))
 
 
-class _Edges:
-    """The correlated pairs from points to centres, or reversed, and sums over them, tile by tile.
-
-    Targets are taken in the order of their degree, so that a tile pads little: a point has up to twice as many centres
-    as a centre has points, and pairs outside the ball are no edges.
-
-    Attributes:
-        order: [T] targets by degree, rounded up to what they are padded to.
-        rank: [T] place of every target in `order`.
-    """
-
-    def __init__(self, features: Tensor, index: Tensor, correlation: Tensor, reverse: bool = False) -> None:
-        B, N, _, C = features.shape
-        _, M, n, K = correlation.shape
-        correlation = correlation.flatten(0, 2)  # [B M n, K]
-        point = (index + N * torch.arange(B, device=index.device)[:, None, None]).flatten()
-        edge = correlation.any(dim=1).nonzero().squeeze(1)  # by centre
-        if reverse:
-            edge = edge[point[edge].argsort(stable=True)]
-        source, target, num_targets = (edge // n, point[edge], B * N) if reverse else (point[edge], edge // n, B * M)
-        degree = target.bincount(minlength=num_targets)
-        first = degree.cumsum(0) - degree
-        length = (degree + _PADDING - 1) // _PADDING * _PADDING
-        self.order = length.argsort(stable=True)
-        self.rank = self.order.argsort()
-        lengths, counts = (t.tolist() for t in length[self.order].unique_consecutive(return_counts=True))
-        edge, source = (pad(t, (0, lengths[-1])) for t in (edge, source))
-        width = _elements_per_block(features) * C
-        self._tiles = []
-        start = 0
-        for longest, count in zip(lengths, counts, strict=True):
-            targets = self.order[start : start + count, None]
-            place = torch.arange(longest, device=index.device)
-            chosen = (first[targets] + place).flatten()
-            weight = correlation.index_select(0, edge[chosen]).view(count, longest, K)
-            weight *= (place < degree[targets])[..., None]
-            sources = source[chosen].view(count, longest)
-            size = max(1, _TILE_ELEMENTS[features.device.type] // (max(1, longest) * width))
-            for part, neighbors in zip(weight.split(size), sources.split(size), strict=True):
-                rows = slice(start, start + len(part))
-                self._tiles.append((rows, neighbors.flatten(), part.transpose(1, 2)))
-                start = rows.stop
-        self._gathered = features.new_empty(width * max(len(sources) for _, sources, _ in self._tiles))
-        self._aggregate = features.new_empty(width * max(weight.shape[0] for _, _, weight in self._tiles) * K)
-
-    def aggregates(self, block: Tensor) -> Iterator[tuple[slice, Tensor]]:
-        """Places in `order`, and their aggregates [t, K, s C] of the sources' features [S, s C]; in one buffer."""
-        width = block.shape[1]
-        for rows, sources, weight in self._tiles:
-            count, K, longest = weight.shape
-            gathered = self._gathered[: len(sources) * width].view(-1, width)
-            torch.index_select(block, 0, sources, out=gathered)
-            aggregate = self._aggregate[: count * K * width].view(count, K, width)
-            torch.bmm(weight, gathered.view(count, longest, width), out=aggregate)
-            yield rows, aggregate
+def _edges(features: Tensor, index: Tensor, correlation: Tensor, reverse: bool = False) -> Edges:
+    _, N, _, C = features.shape
+    return Edges(
+        index, correlation, N, _elements_per_block(features) * C, _TILE_ELEMENTS[features.device.type], reverse
+    )

@@ -18,10 +18,12 @@ INVARIANT = ("part_shape", "assembly", "pivot", "confidence", "pair_pivot", "ass
 PER_HYPOTHESIS = ("axis", "state", "pair_axis")
 
 
-def _network(num_parts=3, order=12, dtype=torch.float32, num_centers=(24, 16), **options) -> ArticulatedNetwork:
+def _network(
+    num_parts=3, order=12, dtype=torch.float32, num_centers=(24, 16), directions=False, **options
+) -> ArticulatedNetwork:
     torch.manual_seed(0)
-    backbone = EquivariantBackbone(order, (4, 8), (0.3, 0.5), 10, 13, num_centers)
-    network = ArticulatedNetwork(backbone, rotation_group(order), 8, 6, num_parts, 5, **options)
+    backbone = EquivariantBackbone(order, (4, 8), (0.3, 0.5), 10, 13, num_centers, directions=directions)
+    network = ArticulatedNetwork(backbone, rotation_group(order), 8, 6, num_parts, 5, directions=directions, **options)
     for parameter in network.parameters():  # untrained heads say almost nothing
         torch.nn.init.normal_(parameter, std=0.4)
     return network.to(dtype).eval()
@@ -69,6 +71,13 @@ def test_rotation_permutes_hypotheses_and_turns_their_poses(joint_type, dtype):
 def test_larger_groups_are_as_exact(order, dtype):
     network = _network(num_parts=2, order=order, dtype=dtype, part_features=False, shared_axis=True)
     assert _rotation_error(network, _cloud(dtype), elements=[1, order // 2, order - 1]) < TOLERANCE[dtype]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_features_on_directions_give_equivariant_hypotheses(dtype):
+    network = _network(order=60, dtype=dtype, directions=True)
+    assert _rotation_error(network, _cloud(dtype)) < TOLERANCE[dtype]
+    assert network(_cloud(dtype)).state.std(dim=1).min() > 1e-3
 
 
 @pytest.mark.parametrize("pool", ["part_pool", "point_pool"])

@@ -3,9 +3,11 @@
 import pytest
 import torch
 
+from articulate_ssl.directions import icosahedron_directions
 from articulate_ssl.equivariance import TOLERANCE, Permutation, Vector, assert_equivariant, off_group_residual
 from articulate_ssl.groups import rotation_group
-from articulate_ssl.network.backbone import EquivariantBackbone, GroupConvolutionBlock
+from articulate_ssl.network.backbone import DirectionConvolutionBlock, EquivariantBackbone, GroupConvolutionBlock
+from articulate_ssl.ops.direction_convolution import direction_convolution
 from articulate_ssl.ops.kernel_points import symmetric_kernel_points
 from articulate_ssl.ops.neighborhood import build_neighborhood
 
@@ -28,6 +30,18 @@ def test_rotations_of_the_cloud_permute_the_group(group_order, intra, separable,
         assert_equivariant(backbone, (points,), backbone.group, [Vector()], Permutation())
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_rotations_of_the_cloud_permute_the_directions(dtype):
+    backbone = _backbone(group_order=60, directions=True, num_kernel_points=13, num_centers=(30, 20)).to(dtype)
+    points = 0.5 * torch.rand(1, 40, 3, dtype=dtype)
+    action = icosahedron_directions(backbone.group).action
+    with torch.no_grad():
+        assert_equivariant(backbone, (points,), backbone.group, [Vector()], Permutation(action))
+        # Pooled over the directions, features still tell a cloud from its mirror image.
+        pooled = [backbone(p).mean(dim=2) for p in (points, points * torch.tensor([-1, 1, 1]))]
+    assert _error(*pooled) > 1e-3
+
+
 def _error(value, expected) -> float:
     return ((value - expected).norm() / expected.norm()).item()
 
@@ -37,10 +51,13 @@ def _with_places(backbone, points):
     return backbone(points) + points.mean(dim=-1)[..., None, None] * torch.linspace(0, 1, 40)[:, None, None]
 
 
-@pytest.mark.parametrize("separable", [False, True])
+CHEAPER = [{}, {"separable": True}, {"directions": True, "group_order": 60}]
+
+
+@pytest.mark.parametrize("options", CHEAPER)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_translation_and_the_order_of_points_do_not_matter(dtype, separable):
-    backbone = _backbone(separable=separable).to(dtype)
+def test_translation_and_the_order_of_points_do_not_matter(dtype, options):
+    backbone = _backbone(**options).to(dtype)
     points = 0.5 * torch.rand(2, 40, 3, dtype=dtype)
     order = torch.randperm(40)
     with torch.no_grad():
@@ -52,10 +69,10 @@ def test_translation_and_the_order_of_points_do_not_matter(dtype, separable):
         assert _error(_with_places(backbone, points[:, order]), expected[:, order]) > 1e-2
 
 
-@pytest.mark.parametrize("separable", [False, True])
+@pytest.mark.parametrize("options", [{"intra": True}, *CHEAPER[1:]])
 @pytest.mark.parametrize("training", [True, False])
-def test_a_cloud_does_not_depend_on_the_rest_of_its_batch(training, separable):
-    backbone = _backbone(intra=True, separable=separable).double().train(training)
+def test_a_cloud_does_not_depend_on_the_rest_of_its_batch(training, options):
+    backbone = _backbone(**options).double().train(training)
     points = 0.5 * torch.rand(3, 40, 3, dtype=torch.float64)
     alone = torch.cat([backbone(cloud[None]) for cloud in points])
     torch.testing.assert_close(backbone(points), alone, rtol=1e-12, atol=1e-12)
@@ -73,9 +90,9 @@ def test_centres_are_the_leading_points():
     assert backbone(points[:, :15]).shape == (2, 15, 12, 6)
 
 
-@pytest.mark.parametrize("separable", [False, True])
-def test_every_parameter_gets_a_gradient(separable):
-    backbone = _backbone(intra=True, separable=separable)
+@pytest.mark.parametrize("options", [{"intra": True}, {"intra": True, "separable": True}, CHEAPER[2]])
+def test_every_parameter_gets_a_gradient(options):
+    backbone = _backbone(**options)
     backbone(0.5 * torch.rand(2, 40, 3)).square().sum().backward()
     for name, parameter in backbone.named_parameters():
         assert parameter.grad.abs().max() > 0, name
@@ -85,6 +102,27 @@ def test_a_separable_backbone_keeps_the_first_kernel_full():
     first, second = _backbone(separable=True).blocks
     assert first.weight.shape == (24, 1, 4)
     assert {n: p.shape for n, p in second.named_parameters(recurse=False)} == {"spatial": (24, 4), "mixing": (4, 6)}
+
+
+def test_features_on_directions_need_the_icosahedral_group_and_no_convolution_over_it():
+    with pytest.raises(ValueError, match="order 60"):
+        _backbone(directions=True)
+    with pytest.raises(ValueError, match="intra"):
+        _backbone(directions=True, group_order=60, intra=True)
+
+
+def test_a_layer_on_directions_starts_at_the_scale_of_a_full_one():
+    torch.manual_seed(0)
+    group = rotation_group(60)
+    kernel = symmetric_kernel_points(group, 13)
+    neighborhood = build_neighborhood(0.5 * torch.rand(1, 60, 3), 0.2, kernel.points, 16)
+    block = DirectionConvolutionBlock(128, 256, icosahedron_directions(group), kernel)
+    full = GroupConvolutionBlock(128, 256, group, kernel, False)
+    with torch.no_grad():
+        features = torch.randn(1, 60, 12, 128)
+        out = direction_convolution(features, neighborhood, block.spatial, block.mixing, block.orbit)
+        expected = full.convolve(torch.randn(1, 60, 60, 128), neighborhood)
+    assert out.std() / expected.std() == pytest.approx(1, abs=0.2)
 
 
 def test_a_separable_layer_starts_at_the_scale_of_a_full_one():

@@ -9,10 +9,12 @@ from articulate_ssl.network.rigid_alignment import RigidAlignment
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-4), (torch.float64, 1e-9)])
-def test_hypotheses_are_equivariant(dtype, tolerance):
+@pytest.mark.parametrize(("order", "directions"), [(12, False), (60, True)])
+def test_hypotheses_are_equivariant(order, directions, dtype, tolerance):
     torch.manual_seed(0)
-    group = rotation_group(12)
-    network = RigidAlignment(EquivariantBackbone(12, (4, 8), (0.3, 0.5), 10, 13, (24, 16)), group, 8, 6, 10)
+    group = rotation_group(order)
+    backbone = EquivariantBackbone(order, (4, 8), (0.3, 0.5), 10, 13, (24, 16), directions=directions)
+    network = RigidAlignment(backbone, group, 8, 6, 10, directions=directions)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.4)
     network.to(dtype)

@@ -3,9 +3,10 @@
 import pytest
 import torch
 
+from articulate_ssl.directions import icosahedron_directions
 from articulate_ssl.equivariance import Permutation, Vector, assert_equivariant
 from articulate_ssl.groups import rotation_group
-from articulate_ssl.network.so3_pointnet import SO3PointNet, largest_product
+from articulate_ssl.network.so3_pointnet import DirectionPointNet, SO3PointNet, largest_product
 
 
 def _problem(order=12):
@@ -46,6 +47,30 @@ def test_rotating_the_cloud_permutes_the_group(order):
             [Permutation(), Vector()],
             Permutation(),
         )
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_part_features_of_directions_are_functions_of_rotations(dtype):
+    torch.manual_seed(0)
+    group = rotation_group(60)
+    directions = icosahedron_directions(group)
+    pointnet = DirectionPointNet(5, 6, directions).to(dtype)
+    features, points = torch.randn(2, 9, 12, 5, dtype=dtype), torch.randn(2, 9, 3, dtype=dtype)
+    association = torch.rand(2, 9, 2, dtype=dtype)
+
+    def pool(features, points):
+        return pointnet(features, points, association)
+
+    with torch.no_grad():
+        out = pool(features, points)
+        assert out.shape == (2, 2, 60, 6)
+        # Directions have a stabiliser of five elements; what is read off all of them tells these apart.
+        assert torch.cdist(out, out).add(10 * torch.eye(60)).min() > 1e-3
+        inputs, actions = (features, points), [Permutation(directions.action), Vector()]
+        assert_equivariant(pool, inputs, group, actions, Permutation())
+        pointnet.order = pointnet.order.roll(1, 0)[:, group.inverse]
+        with pytest.raises(AssertionError, match="not equivariant"):
+            assert_equivariant(pool, inputs, group, actions, Permutation())
 
 
 def test_a_point_of_association_zero_is_not_seen():
