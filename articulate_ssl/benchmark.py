@@ -35,6 +35,7 @@ from torch.nn.functional import leaky_relu
 from articulate_ssl.module import ArticulatedPoseModule
 from articulate_ssl.network.backbone import EquivariantBackbone
 from articulate_ssl.ops import chamfer, reference
+from articulate_ssl.ops.direction_convolution import direction_convolution
 from articulate_ssl.ops.group_convolution import group_convolution
 from articulate_ssl.ops.kernel_points import symmetric_kernel_points
 from articulate_ssl.ops.neighborhood import Neighborhood, build_neighborhood
@@ -212,8 +213,7 @@ def operators(machine: Machine) -> list[Result]:
     results.append(Result("conv_fwd_bwd_ratio", "convolution 64 -> 128, forward + backward", ratios, "x"))
     results.append(Result(None, "  ours", seconds, "s"))
 
-    separable = EquivariantBackbone(separable=True).to(machine.device)
-    results += _separable(machine, separable, points, features, neighborhood)
+    results += cheaper_backbones(machine, points, features.detach(), neighborhood)
 
     original = OriginalBackbone(backbone)
 
@@ -244,35 +244,42 @@ def operators(machine: Machine) -> list[Result]:
     return results
 
 
-def _separable(
-    machine: Machine, backbone: EquivariantBackbone, points: Tensor, features: Tensor, neighborhood: Neighborhood
-) -> list[Result]:
-    """The separable layer 64 -> 128 against its twin, and a backbone of such layers."""
-    block = backbone.blocks[1]
-    arguments = (features, neighborhood, block.spatial, block.mixing, block.permutation)
+def cheaper_backbones(machine: Machine, points: Tensor, features: Tensor, neighborhood: Neighborhood) -> list[Result]:
+    """Layers 64 -> 128 of the cheaper kinds against their twins, and backbones of such layers."""
+    kinds = {
+        "separable": (separable_group_convolution, reference.separable_group_convolution, "permutation"),
+        "directions": (direction_convolution, reference.direction_convolution, "orbit"),
+    }
+    results = []
+    for name, (function, twin, table) in kinds.items():
+        backbone = EquivariantBackbone(**{name: True}).to(machine.device)
+        block = backbone.blocks[1]
+        indexed = features[:, :, : len(getattr(block, table))].requires_grad_()  # by group elements or directions
+        arguments = (indexed, neighborhood, block.spatial, block.mixing, getattr(block, table))
 
-    def layer() -> Tensor:
-        with machine.autocast():
-            return separable_group_convolution(*arguments)
+        def layer(function: Callable = function, arguments: tuple = arguments) -> Tensor:
+            with machine.autocast():
+                return function(*arguments)
 
-    def forward() -> Tensor:
-        with machine.autocast():
-            return backbone(points)
+        def forward(backbone: EquivariantBackbone = backbone) -> Tensor:
+            with machine.autocast():
+                return backbone(points)
 
-    twin = _forward_backward(lambda: reference.separable_group_convolution(*arguments))
-    ratios, seconds = _ratio(machine, twin, _forward_backward(layer), 5)
-    run = _forward_backward(forward)
-    memory = machine.peak_bytes(run)
-    whole = [machine.seconds(run) for _ in range(3)]
-    with torch.no_grad():
-        once = [machine.seconds(forward) for _ in range(3)]
-    return [
-        Result(None, "separable convolution 64 -> 128, forward + backward", ratios, "x"),
-        Result(None, "  ours", seconds, "s"),
-        Result(None, "separable backbone, forward", once, "s"),
-        Result(None, "  forward + backward", whole, "s"),
-        Result(None, "  peak memory", [memory / 1e9], "GB"),
-    ]
+        slow = _forward_backward(lambda twin=twin, arguments=arguments: twin(*arguments))
+        ratios, seconds = _ratio(machine, slow, _forward_backward(layer), 5)
+        run = _forward_backward(forward)
+        memory = machine.peak_bytes(run)
+        whole = [machine.seconds(run) for _ in range(3)]
+        with torch.no_grad():
+            once = [machine.seconds(forward) for _ in range(3)]
+        results += [
+            Result(None, f"{name}: convolution 64 -> 128, forward + backward", ratios, "x"),
+            Result(None, "  ours", seconds, "s"),
+            Result(None, f"{name}: backbone, forward", once, "s"),
+            Result(None, "  forward + backward", whole, "s"),
+            Result(None, "  peak memory", [memory / 1e9], "GB"),
+        ]
+    return results
 
 
 def ceiling(machine: Machine, backbone_seconds: float) -> list[Result]:
@@ -387,7 +394,6 @@ def whole_network(machine: Machine) -> list[Result]:
     results = [Result("train_step_s_cpu_profile", label, [machine.seconds(step) for _ in range(7)], "s")]
 
     module = build_module(machine, NetworkOptions()).eval()
-    separable = build_module(machine, NetworkOptions(separable=True)).eval()
 
     def infer(clouds: int, module: ArticulatedPoseModule = module) -> Callable[[], None]:
         points = _clouds(machine, clouds, 512)
@@ -407,11 +413,12 @@ def whole_network(machine: Machine) -> list[Result]:
         Result("inference_clouds_per_s_b1", "inference, paper size, batch 1", [1 / s for s in seconds], "/s")
     )
     results.append(Result(None, "  peak memory", [machine.peak_bytes(one) / 1e9], "GB"))
-    one = infer(1, separable)
-    one()
-    seconds = [machine.seconds(one) for _ in range(20 if on_gpu else 3)]
-    results.append(Result(None, "  separable", [1 / s for s in seconds], "/s"))
-    results.append(Result(None, "  separable, peak memory", [machine.peak_bytes(one) / 1e9], "GB"))
+    for name in ("separable", "directions"):
+        cheaper = infer(1, build_module(machine, NetworkOptions(**{name: True})).eval())
+        cheaper()
+        seconds = [machine.seconds(cheaper) for _ in range(20 if on_gpu else 5)]
+        results.append(Result(f"inference_clouds_per_s_b1_{name}", f"  {name}", [1 / s for s in seconds], "/s"))
+        results.append(Result(None, f"  {name}, peak memory", [machine.peak_bytes(cheaper) / 1e9], "GB"))
     if on_gpu:
         many()
     seconds = [machine.seconds(many) for _ in range(5 if on_gpu else 1)]
