@@ -34,7 +34,7 @@ from articulate_ssl.options import (
 from articulate_ssl.pose_estimation import PoseEstimator
 from articulate_ssl.prediction import Prediction
 from articulate_ssl.recipes.objective import PoseTarget, Terms, paper_terms, staged_terms, winning_hypothesis
-from articulate_ssl.recipes.part_discovery import ArticulatedTemplate, dense_template, discover
+from articulate_ssl.recipes.part_discovery import ArticulatedTemplate, discover
 from datamodules.articulated_dataset import split_labels
 from datamodules.geometry import PRISMATIC, REVOLUTE, invert_se3, se3, transform_points
 
@@ -332,12 +332,11 @@ class ArticulatedPoseModule(LightningModule):
             "base": found.base[kept],
             "state": found.state[kept],
         }
-        self._adopt(found, dense)
+        self._adopt(found)
 
-    def _adopt(self, found: ArticulatedTemplate, dense: Tensor) -> None:
+    def _adopt(self, found: ArticulatedTemplate) -> None:
         """Make the discovered template and joints the network's category-level shapes and joints."""
-        net = self.articulated
-        template = dense_template(found, dense)
+        net, template = self.articulated, found.template
         for part in range(self.num_parts):
             points = template.points[template.label == part].cpu().numpy()
             order = farthest_point_order(points, min(len(points), net.shape_points))

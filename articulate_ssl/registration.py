@@ -22,11 +22,11 @@ _BATCH_ENTRIES = 2**22  # entries of one responsibility matrix
 # What turns a part about an axis by so little (a thin rod about its length) is noise: such a rotation stays as it was.
 _INERTIA = 0.02
 
-# Of each stage of a search: points, correspondence scales, rounds, survivors, and whether those are to be different.
+# Of each stage of a search: points, correspondence scales, rounds, survivors.
 _HALVING = (
-    (48, (0.14, 0.10), 2, 24, False),
-    (96, (0.10, 0.04), 5, 4, True),
-    (256, (0.05, 0.02), 12, 4, True),
+    (96, (0.14, 0.08), 3, 24),
+    (128, (0.08, 0.04), 4, 12),
+    (256, (0.05, 0.03), 4, 12),
 )
 _SAME = 0.5  # radians: orientations closer than this are one hypothesis
 
@@ -213,14 +213,14 @@ def search_articulated(
     rotations: Tensor,  # [H, 3, 3] starts, about the centres
     states: Tensor,  # [Q, J] joint states to start from
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Best articulated registration of every cloud over all orientations and joint states.
+    """The best, different articulated registrations of every cloud over all orientations and joint states.
 
-    Successive halving: all starts get two rounds on few points, the better ones some more, and a few different ones
-    the last. All points decide between those: what tells a laptop's lid from its base is finer than the spacing of the
-    few points that suffice to register it.
+    Successive halving: all starts get a few rounds on few points, the better ones, if they differ, some more. All
+    points order the last: what tells a laptop's lid from its base is finer than the spacing of the few points that
+    suffice to register it.
 
     Returns:
-        Base poses [n, 4, 4], joint states [n, J], Chamfer-L1 errors [n].
+        Base poses [n, C, 4, 4], joint states [n, C, J], Chamfer-L1 errors [n, C], best first.
     """
     still = torch.eye(4).to(clouds).expand(len(states), 4, 4)
     shapes = template.posed(joints.part_pose(still, states))  # [Q, T, 3]
@@ -228,20 +228,19 @@ def search_articulated(
     base = se3(rotations[None, :, None].expand(len(clouds), -1, len(states), -1, -1), shift).flatten(1, 2)
     state = states.repeat(len(rotations), 1).expand(len(clouds), -1, -1)
     rows = torch.arange(len(clouds), device=clouds.device)[:, None]
-    for num_points, scales, rounds, survivors, different in _HALVING:
+    for num_points, scales, rounds, survivors in _HALVING:
         count = base.shape[1]
         copies = clouds[:, :num_points].repeat_interleave(count, dim=0)
         flat = register_articulated(
             template.thinned(num_points), joints, copies, base.flatten(0, 1), state.flatten(0, 1), scales, rounds
         )
         base, state, error = (value.unflatten(0, (len(clouds), count)) for value in flat)
-        survivors = min(survivors, count)
-        best = _different(base, error, survivors) if different else error.topk(survivors, largest=False).indices
+        best = _different(base, error, min(survivors, count))
         base, state, error = base[rows, best], state[rows, best], error[rows, best]
     posed = template.posed(joints.part_pose(base.flatten(0, 1), state.flatten(0, 1)))
     error = chamfer_l1(clouds.repeat_interleave(base.shape[1], dim=0), posed).unflatten(0, (len(clouds), -1))
-    best = error.argmin(dim=1, keepdim=True)
-    return base[rows, best][:, 0], state[rows, best][:, 0], error[rows, best][:, 0]
+    order = error.argsort(dim=1)
+    return base[rows, order], state[rows, order], error[rows, order]
 
 
 def _different(base: Tensor, error: Tensor, count: int) -> Tensor:

@@ -21,7 +21,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from articulate_ssl.groups import rotation_group
-from articulate_ssl.kinematic_chain import extract_chain, pair_index
+from articulate_ssl.kinematic_chain import KinematicChain, extract_chain, pair_index
+from articulate_ssl.ops.chamfer import nearest_squared_distance
+from articulate_ssl.recipes.instance_fit import InstanceFit, smooth_labels
 from articulate_ssl.recipes.screw_fit import fit_screw
 from articulate_ssl.registration import (
     JointModel,
@@ -32,7 +34,14 @@ from articulate_ssl.registration import (
     search_articulated,
     update_poses,
 )
-from datamodules.geometry import invert_se3, se3, transform_points
+from datamodules.geometry import REVOLUTE, invert_se3, se3, transform_points
+
+# Shares of the template that slabs and restless points take.
+SLABS = (0.1, 0.2)
+UNREST = (0.08, 0.15, 0.3)
+# Cycles of descent on every split, and how many splits go on.
+HALVING = ((4, 8), (6, 3), (12, 1))
+SEARCH_CYCLES = 4  # of descent on every candidate of a search
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +62,8 @@ class DiscoveryOptions:
         dense_points: The same where it is decided between registrations.
         starts: Random splits.
         jointed: The splits that explain the clouds best, to which joints are fitted.
-        rounds: Rounds of articulated search, relabelling and joint fitting.
+        rounds: Rounds of articulated search and descent on labels and joints.
+        cycles: Cycles of descent in a round.
         keep: Share of the clouds, best fitted first, that labels and joints are solved from.
         min_share: Splits with a part smaller than this share of the template are discarded.
         seed: Of the random splits.
@@ -67,6 +77,7 @@ class DiscoveryOptions:
     starts: int = 24
     jointed: int = 6
     rounds: int = 3
+    cycles: int = 12
     keep: float = 0.75
     min_share: float = 0.05
     seed: int = 0
@@ -84,7 +95,7 @@ class ArticulatedTemplate:
         joints: Joint lines and kinematic chain.
         base: [n, 4, 4] canonical object space -> cloud.
         state: [n, J] zero-mean joint states.
-        error: [n] Chamfer-L1 distance of every cloud to its reconstruction.
+        error: [n] of every cloud's reconstruction, stretched (`InstanceFit.error`).
     """
 
     template: LabelledTemplate
@@ -110,37 +121,54 @@ def discover(
         DiscoveryError: if no split into `num_parts` moving parts survives.
     """
     clouds = clouds[:, : options.dense_points].contiguous()
+    generator = torch.Generator().manual_seed(options.seed)
     reference = clouds[choose_reference(clouds)]
     rotations = rotation_group(60).elements.to(clouds)
     coarse = max(64, options.points // 2)
     few = clouds[:: max(1, len(clouds) // options.search_clouds)][: options.search_clouds]
-    thin = few[:, : options.points]
-    rigid, error = register_rigid(reference[:coarse], thin[:, :coarse], rotations, keep=1)
+    rigid, error = register_rigid(reference[:coarse], few[:, :coarse], rotations, keep=1)
     log.info("rigid alignment: median Chamfer-L1 %.4f", error[:, 0].median())
 
     best_aligned = error[:, 0].argsort()[: options.split_clouds]
-    aligned = transform_points(invert_se3(rigid[best_aligned, 0]), thin[best_aligned])
-    found = split_template(aligned, reference, num_parts, joint_type, options)
-    log.info("best split of %d starts: Chamfer-L1 %.4f", options.starts, found.error.mean())
+    aligned = transform_points(invert_se3(rigid[best_aligned, 0]), few[best_aligned])
+    found = split_template(aligned, reference, num_parts, joint_type, options, generator)
+    log.info("best split: error %.4f", found.error.mean())
 
     for step in range(options.rounds):
-        base, state, error = _search(found, few, rotations)
+        base, state, error = _search(found, few, rotations, generator)
         kept = error.argsort()[: max(1, int(options.keep * len(few)))]
-        pose = found.joints.part_pose(base[kept], state[kept])
-        template = found.template
-        for scale in (0.03, 0.028, 0.026, 0.024, 0.022, 0.02):
-            pose = update_poses(template.thinned(options.points), pose, thin[kept], scale)
-            template = relabel(template, pose, thin[kept], cap=4 * scale)
-        if torch.bincount(template.label, minlength=num_parts).min() < options.min_share * len(template.label):
+        fit = InstanceFit(found.template, found.joints, base[kept], state[kept], generator)
+        fit.optimise(few[kept], options.cycles, keep=options.keep)
+        if _smallest_share(fit.template) < options.min_share:
             log.warning("round %d lost a part; keeping the parts of the round before", step + 1)
             break
-        found = fit_joints(template, pose, thin[kept], joint_type)
-        log.info("round %d: Chamfer-L1 %.4f of the kept clouds", step + 1, found.error.mean())
-    base, state, error = _search(found, clouds, rotations)
+        found = _as_found(fit, few[kept])
+        log.info("round %d: error %.4f of the kept clouds", step + 1, found.error.mean())
+    base, state, error = _search(found, clouds, rotations, generator)
     return replace(found, base=base, state=state, error=error)
 
 
-def _search(found: ArticulatedTemplate, clouds: Tensor, rotations: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _as_found(fit: InstanceFit, clouds: Tensor) -> ArticulatedTemplate:
+    joints, base, state = fit.model()
+    return ArticulatedTemplate(fit.template, _centred_pivots(joints, fit.template), base, state, fit.error(clouds))
+
+
+def _centred_pivots(joints: JointModel, template: LabelledTemplate) -> JointModel:
+    """Where a pivot sits along its axis is a convention: the middle of the part it moves."""
+    center = torch.stack([template.points[template.label == child].mean(dim=0) for child in joints.chain.child])
+    along = ((center - joints.pivot) * joints.axis).sum(dim=1, keepdim=True)
+    return replace(joints, pivot=joints.pivot + along * joints.axis)
+
+
+def _smallest_share(template: LabelledTemplate) -> float:
+    counts = torch.bincount(template.label, minlength=template.num_parts)
+    return float(counts.min() / counts.sum())
+
+
+def _search(
+    found: ArticulatedTemplate, clouds: Tensor, rotations: Tensor, generator: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Base poses, joint states and errors of the clouds: of the candidates, the one that fits best when stretched."""
     spread = 1.5 * found.state.std(dim=0)
     # The middle, and every combination of either side.
     states = torch.cartesian_prod(*torch.stack([-spread, spread], dim=-1)).view(-1, len(spread))
@@ -148,45 +176,18 @@ def _search(found: ArticulatedTemplate, clouds: Tensor, rotations: Tensor) -> tu
     limits = torch.quantile(found.state, torch.tensor([0.05, 0.95]).to(states), dim=0)
     margin = 0.15 * (limits[1] - limits[0])
     joints = replace(found.joints, limits=torch.stack([limits[0] - margin, limits[1] + margin], dim=-1))
-    return search_articulated(found.template, joints, clouds, rotations, states)
-
-
-def dense_template(
-    found: ArticulatedTemplate,
-    clouds: Tensor,  # [n, P, 3] the clouds that `found` is registered to, more densely
-    points: int = 1024,
-    keep: float = 0.75,
-) -> LabelledTemplate:
-    """A denser template: the best fitted cloud near the canonical state, every point labelled by all clouds' evidence.
-
-    Parts that lie against each other (a closed laptop) cannot be told apart in one cloud, hence a cloud near the mean
-    state, and hence the labels from which part's motion explains a point in the other clouds.
-
-    Raises:
-        DiscoveryError: if a part is left without points.
-    """
-    clouds = clouds[:, :points]
-    distance = (found.state / found.state.std(dim=0)).abs().amax(dim=1)
-    central = distance <= distance.quantile(0.3)
-    reference = int(found.error.masked_fill(~central, torch.inf).argmin())
-    pose = found.part_pose()
-    inverse = invert_se3(pose[reference])
-    cloud = clouds[reference]
-    nearest = torch.cdist(cloud, found.template.posed(pose[reference, None])[0]).argmin(dim=1)
-    label = found.template.label[nearest]
-    kept = found.error.argsort()[: max(1, int(keep * len(clouds)))]
-    rows = torch.arange(len(cloud), device=cloud.device)
-    for _ in range(2):
-        canonical = transform_points(inverse, cloud)[label, rows]
-        template = LabelledTemplate(canonical, label, found.template.num_parts)
-        label = relabel(template, pose[kept], clouds[kept], cap=0.04).label
-    counts = torch.bincount(label, minlength=found.template.num_parts)
-    if counts.min() < 4:
-        raise DiscoveryError(
-            f"part discovery lost a part (points per part: {counts.tolist()}): the clouds do not show "
-            f"{found.template.num_parts} parts that move on their own; check the category's number of parts"
-        )
-    return LabelledTemplate(transform_points(inverse, cloud)[label, rows], label, found.template.num_parts)
+    base, state, _ = search_articulated(found.template, joints, clouds, rotations, states)
+    copies = clouds.repeat_interleave(base.shape[1], dim=0)
+    fit = InstanceFit(found.template, joints, base.flatten(0, 1), state.flatten(0, 1), generator)
+    fit.optimise(copies, SEARCH_CYCLES, shared=False)
+    # A hypothesis that leaves a part unexplained is to pay for it.
+    error = fit.error(copies, softened=False).unflatten(0, base.shape[:2])
+    best = error.argmin(dim=1)
+    rows = torch.arange(len(clouds), device=clouds.device)
+    base, state = (value.unflatten(0, error.shape)[rows, best] for value in fit.model()[1:])
+    fit = InstanceFit(found.template, joints, base, state, generator)
+    fit.optimise(clouds, 2 * SEARCH_CYCLES, shared=False)
+    return *fit.model()[1:], fit.error(clouds, softened=False)
 
 
 def choose_reference(clouds: Tensor) -> int:
@@ -203,38 +204,88 @@ def random_split(template: Tensor, num_parts: int, generator: torch.Generator) -
     return torch.bucketize(height, torch.quantile(height, cuts.to(template)))
 
 
+def slab_cuts(template: Tensor, num_parts: int, generator: torch.Generator) -> list[Tensor]:
+    """[T] labels that part a slab from the rest, at either end of each principal axis; doors are slabs."""
+    height = template @ _principal_frame(template)[:3, :3].T
+    slabs = [sign * h for h in height.T for sign in (-1, 1)]
+    return [_cut_off(template, slab, share, num_parts, generator) for slab in slabs for share in SLABS]
+
+
+def unrest_cuts(aligned: Tensor, template: Tensor, num_parts: int, generator: torch.Generator) -> list[Tensor]:
+    """[T] labels that part the points whose distance to the clouds varies most when nothing but the whole can move."""
+    whole = LabelledTemplate(template, torch.zeros(len(template), dtype=torch.long, device=template.device), 1)
+    nothing = template.new_zeros(0, 3)
+    joints = JointModel(KinematicChain(1, 0, (), ()), nothing, nothing, REVOLUTE)
+    pose = torch.eye(4).to(template).expand(len(aligned), 4, 4)
+    fit = InstanceFit(whole, joints, pose, template.new_zeros(len(aligned), 0), generator)
+    fit.optimise(aligned, SEARCH_CYCLES, shared=False)
+    unrest = nearest_squared_distance(fit.posed(), aligned).sqrt().std(dim=0)
+    near = torch.cdist(template, template).topk(min(24, len(template)), largest=False).indices
+    unrest = unrest[near].mean(dim=1)
+    return [_cut_off(template, unrest, share, num_parts, generator) for share in UNREST]
+
+
+def _cut_off(template: Tensor, height: Tensor, share: float, num_parts: int, generator: torch.Generator) -> Tensor:
+    """Part 0 is all but the highest share, which is cut at random into the others."""
+    high = height > height.quantile(1 - share)
+    label = torch.zeros(len(template), dtype=torch.long, device=template.device)
+    label[high] = 1 if num_parts == 2 else 1 + random_split(template[high], num_parts - 1, generator)
+    return label
+
+
 def split_template(
     aligned: Tensor,  # [n, N, 3]
     template: Tensor,  # [T, 3]
     num_parts: int,
     joint_type: int,
     options: DiscoveryOptions,
+    generator: torch.Generator,
 ) -> ArticulatedTemplate:
-    """Best of many random splits after multi-body registration.
+    """The split and joints that explain the clouds best when every cloud's object may stretch its parts.
 
     Raises:
         DiscoveryError: if every start loses a part.
     """
-    generator = torch.Generator().manual_seed(options.seed)
-    splits = []
+    thin = aligned[:, : options.points]
+    bodies = []
     for _ in range(options.starts):
-        labelled = LabelledTemplate(template, random_split(template, num_parts, generator), num_parts)
-        pose = torch.eye(4).to(template).expand(len(aligned), num_parts, 4, 4)
-        for step, scale in enumerate(torch.logspace(-1.1, -1.7, 16).tolist()):
-            pose = update_poses(labelled.thinned(options.points), pose, aligned, scale)
-            if step % 2 == 1:
-                labelled = relabel(labelled, pose, aligned, cap=4 * scale)
-        share = torch.bincount(labelled.label, minlength=num_parts) / len(template)
-        if share.min() >= options.min_share:
-            splits.append((_trimmed(chamfer_l1(aligned, labelled.posed(pose)), options), labelled, pose))
-    if not splits:
+        label = random_split(template, num_parts, generator)
+        labelled, pose = _moving_bodies(template, label, num_parts, thin, relabelled=True)
+        if _smallest_share(labelled) >= options.min_share:
+            bodies.append((_trimmed(chamfer_l1(thin, labelled.posed(pose)), options), labelled, pose))
+    bodies = [(labelled, pose) for _, labelled, pose in sorted(bodies, key=lambda body: body[0])[: options.jointed]]
+    for label in slab_cuts(template, num_parts, generator) + unrest_cuts(aligned, template, num_parts, generator):
+        bodies.append(_moving_bodies(template, label, num_parts, thin, relabelled=False))
+
+    fits = []
+    for labelled, pose in bodies:
+        if _smallest_share(labelled) >= options.min_share:
+            found = fit_joints(labelled, pose, thin, joint_type)
+            fits.append(InstanceFit(found.template, found.joints, found.base, found.state, generator))
+    for cycles, survivors in HALVING:
+        for fit in fits:
+            fit.optimise(aligned, cycles, keep=options.keep)
+        fits = [fit for fit in fits if _smallest_share(fit.template) >= options.min_share]
+        fits = sorted(fits, key=lambda fit: _trimmed(fit.error(aligned), options))[:survivors]
+    if not fits:
         raise DiscoveryError(
-            f"part discovery lost a part in all {options.starts} starts: the clouds do not show {num_parts} parts that "
+            f"part discovery lost a part in all {len(bodies)} starts: the clouds do not show {num_parts} parts that "
             "move on their own; check the category's number of parts, or allow more starts"
         )
-    splits.sort(key=lambda split: split[0])
-    fits = [fit_joints(labelled, pose, aligned, joint_type) for _, labelled, pose in splits[: options.jointed]]
-    return min(fits, key=lambda found: _trimmed(found.error, options))
+    return _as_found(fits[0], aligned)
+
+
+def _moving_bodies(
+    template: Tensor, label: Tensor, num_parts: int, clouds: Tensor, relabelled: bool
+) -> tuple[LabelledTemplate, Tensor]:
+    """Register the pieces of a template to aligned clouds, each on its own; `relabelled`, give points to the pieces."""
+    labelled = LabelledTemplate(template, label, num_parts)
+    pose = torch.eye(4).to(template).expand(len(clouds), num_parts, 4, 4)
+    for step, scale in enumerate(torch.logspace(-1.1, -1.7, 16).tolist()):
+        pose = update_poses(labelled.thinned(clouds.shape[1]), pose, clouds, scale)
+        if relabelled and step % 2 == 1:
+            labelled = relabel(labelled, pose, clouds, cap=4 * scale)
+    return labelled, pose
 
 
 def _trimmed(error: Tensor, options: DiscoveryOptions) -> float:
@@ -247,7 +298,6 @@ def relabel(
     pose: Tensor,  # [n, K, 4, 4]
     clouds: Tensor,  # [n, N, 3]
     cap: float,  # distances beyond this count as this
-    neighbors: int = 16,
 ) -> LabelledTemplate:
     """Give every template point to the part whose motion brings it closest to the clouds, smoothed over neighbours."""
     cost = template.points.new_zeros(len(template.points), template.num_parts)
@@ -255,8 +305,7 @@ def relabel(
         moved = transform_points(pose[:, part], template.points)  # [n, T, 3]
         for cloud, points in zip(clouds.split(32), moved.split(32), strict=True):
             cost[:, part] += torch.cdist(points, cloud).amin(dim=2).clamp(max=cap).sum(dim=0)
-    near = torch.cdist(template.points, template.points).topk(neighbors, largest=False).indices
-    return replace(template, label=cost[near].mean(dim=1).argmin(dim=-1))
+    return replace(template, label=smooth_labels(template.points, cost))
 
 
 def fit_joints(
@@ -298,12 +347,8 @@ def fit_joints(
     points = transform_points(frame, points)
     axis = torch.stack(axes) @ frame[:3, :3].T
     pivot = transform_points(frame, torch.stack(pivots))
-    # Where a pivot sits along its axis is a convention: the middle of the part it moves.
-    center = torch.stack([points[template.label == child].mean(dim=0) for child in chain.child])
-    pivot = pivot + ((center - pivot) * axis).sum(dim=1, keepdim=True) * axis
-
-    joints = JointModel(chain, axis, pivot, joint_type)
     template, state = replace(template, points=points), torch.stack(states, dim=1)
+    joints = _centred_pivots(JointModel(chain, axis, pivot, joint_type), template)
     base = pose[:, chain.root] @ invert_se3(frame)
     few = template.thinned(clouds.shape[1])
     base, state, error = register_articulated(few, joints, clouds, base, state, (0.03, 0.02), 8)

@@ -52,9 +52,18 @@ GLASSES = (
 
 
 def clouds(
-    design=LAPTOP, count: int = 6, points: int = 128, resample: bool = False, rotate: bool = True, seed: int = 0
+    design=LAPTOP,
+    count: int = 6,
+    points: int = 128,
+    resample: bool = False,
+    rotate: bool = True,
+    seed: int = 0,
+    proportions: float = 0.0,
 ) -> Clouds:
-    """Clouds of one object at random states and orientations; `resample` draws other surface points for each."""
+    """Clouds of one object at random states and orientations; `resample` draws other surface points for each.
+
+    With `proportions`, every cloud shows an object of its own, longer or shorter along each axis by up to this factor.
+    """
     generator = torch.Generator().manual_seed(seed)
     boxes, parents, joints, ranges, joint_type = design
     K = len(boxes)
@@ -75,14 +84,17 @@ def clouds(
     if rotate:
         rotation = roma.unitquat_to_rotmat(roma.quat_normalize(torch.randn(count, 4, generator=generator)))
     rest = surface()
+    size = torch.ones(count, 1, 3)
+    if proportions:
+        size = (proportions * (2 * torch.rand(count, 1, 3, generator=generator) - 1)).exp()
     motion = forward_kinematics(
-        screw_motion(axis.expand(count, -1, 3), pivot.expand(count, -1, 3), state, joint_type),
+        screw_motion(axis.expand(count, -1, 3), size * pivot, state, joint_type),
         parents,
         range(1, K),
         K,
     )
     shapes = torch.stack([surface() if resample else rest for _ in range(count)])
-    posed = transform_points(motion[:, part], shapes[:, :, None])[:, :, 0]
+    posed = transform_points(motion[:, part], (size * shapes)[:, :, None])[:, :, 0]
     center = posed.mean(dim=1)
     base = se3(rotation, -(rotation @ center[..., None]).squeeze(-1))
     return Clouds(transform_points(base, posed), rest, part, base, state, axis, pivot)
