@@ -41,6 +41,7 @@ SLABS = (0.1, 0.2)
 UNREST = (0.08, 0.15, 0.3)
 # Cycles of descent on every split, and how many splits go on.
 HALVING = ((4, 8), (6, 3), (12, 1))
+STILL = 0.01  # in normalised units: what moves less is not a part
 SEARCH_CYCLES = 4  # of descent on every candidate of a search
 
 log = logging.getLogger(__name__)
@@ -244,7 +245,7 @@ def split_template(
     """The split and joints that explain the clouds best when every cloud's object may stretch its parts.
 
     Raises:
-        DiscoveryError: if every start loses a part.
+        DiscoveryError: if in every start a part is lost or does not move.
     """
     thin = aligned[:, : options.points]
     bodies = []
@@ -265,14 +266,27 @@ def split_template(
     for cycles, survivors in HALVING:
         for fit in fits:
             fit.optimise(aligned, cycles, keep=options.keep)
-        fits = [fit for fit in fits if _smallest_share(fit.template) >= options.min_share]
+        fits = [
+            fit for fit in fits if _smallest_share(fit.template) >= options.min_share and _least_motion(fit) > STILL
+        ]
         fits = sorted(fits, key=lambda fit: _trimmed(fit.error(aligned), options))[:survivors]
     if not fits:
         raise DiscoveryError(
-            f"part discovery lost a part in all {len(bodies)} starts: the clouds do not show {num_parts} parts that "
-            "move on their own; check the category's number of parts, or allow more starts"
+            f"part discovery found no part that moves in any of {len(bodies)} starts: the clouds do not show "
+            f"{num_parts} parts that move on their own; check the category's number of parts, or allow more starts"
         )
     return _as_found(fits[0], aligned)
+
+
+def _least_motion(fit: InstanceFit) -> float:
+    """Standard deviation over the clouds of how far a joint moves the part on it, of the joint that moves least."""
+    joints, _, state = fit.model()
+    spread = state.std(dim=0)
+    if joints.joint_type == REVOLUTE:
+        for j, child in enumerate(joints.chain.child):
+            offset = fit.template.points[fit.template.label == child] - joints.pivot[j]
+            spread[j] *= torch.linalg.cross(offset, joints.axis[j].expand_as(offset)).norm(dim=1).mean()
+    return float(spread.min())
 
 
 def _moving_bodies(
