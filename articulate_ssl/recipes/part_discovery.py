@@ -1,14 +1,16 @@
 """Part discovery: find a category's parts and joints from unlabelled clouds alone, by registration.
 
 1. *Rigid alignment*: one typical cloud is registered to all others from every group rotation.
-2. *Splits*: cut the typical cloud into K pieces at random, register every piece to every aligned cloud on its own, and
-   give each template point to the piece whose motion explains it best in all clouds: points that move together end up
-   together. Of many random cuts the winner is the one that reconstructs best *after* each pair's relative motion has
-   been reduced to one joint, which is what a wrong split cannot survive.
+2. *Splits*: cut the typical cloud into K pieces, register every piece to every aligned cloud on its own, and reduce the
+   motion between them to joints. Random cuts are first refined by giving each template point to the piece whose motion
+   explains it best in all clouds: points that move together end up together. Slabs and restless points are taken as
+   they are, since a small door would drown in that. From every split labels, joints and each cloud's proportions
+   descend together (`instance_fit`), the better ones for longer. The winner reconstructs best with joints and
+   proportions, which is what a wrong split cannot do.
 3. *Rounds*: search every cloud again with the articulated template, from many orientations (this is what rights clouds
-   that the rigid template fitted upside down), then solve labels and joints again from the clouds that fit.
+   that the rigid template fitted upside down), then descend again on the clouds that fit.
 
-No network, no gradient, no label. It is to the staged recipe what the "zero iteration" is to the original.
+No network, no label. It is to the staged recipe what the "zero iteration" is to the original.
 """
 
 from __future__ import annotations
@@ -37,12 +39,11 @@ from articulate_ssl.registration import (
 from datamodules.geometry import REVOLUTE, invert_se3, se3, transform_points
 
 # Shares of the template that slabs and restless points take.
-SLABS = (0.1, 0.2)
-UNREST = (0.08, 0.15, 0.3)
-# Cycles of descent on every split, and how many splits go on.
-HALVING = ((4, 8), (6, 3), (12, 1))
-STILL = 0.01  # in normalised units: what moves less is not a part
-SEARCH_CYCLES = 4  # of descent on every candidate of a search
+_SLABS = (0.1, 0.2)
+_UNREST = (0.08, 0.15, 0.3)
+_HALVING = ((4, 8), (6, 3), (12, 1))  # cycles of descent on every split, and how many splits go on
+_STILL = 0.01  # in normalised units: what moves less is not a part
+_SEARCH_CYCLES = 4  # of descent on every candidate of a search
 
 log = logging.getLogger(__name__)
 
@@ -89,14 +90,14 @@ class ArticulatedTemplate:
     """A category's labelled template with joints, registered to n clouds.
 
     Canonical object space has the template's principal axes as coordinate axes, so that the half-turns under which an
-    object nearly maps to itself are elements of the rotation group. Every joint is at the clouds' mean state.
+    object nearly maps to itself are elements of the rotation group. State zero of every joint is near the clouds' mean.
 
     Attributes:
         template: [T] labelled points.
         joints: Joint lines and kinematic chain.
         base: [n, 4, 4] canonical object space -> cloud.
-        state: [n, J] zero-mean joint states.
-        error: [n] of every cloud's reconstruction, stretched (`InstanceFit.error`).
+        state: [n, J] joint states.
+        error: [n] distance of every cloud to its reconstruction, stretched to its proportions (`InstanceFit.error`).
     """
 
     template: LabelledTemplate
@@ -151,7 +152,8 @@ def discover(
 
 def _as_found(fit: InstanceFit, clouds: Tensor) -> ArticulatedTemplate:
     joints, base, state = fit.model()
-    return ArticulatedTemplate(fit.template, _centred_pivots(joints, fit.template), base, state, fit.error(clouds))
+    error = fit.error(clouds, softened=False)
+    return ArticulatedTemplate(fit.template, _centred_pivots(joints, fit.template), base, state, error)
 
 
 def _centred_pivots(joints: JointModel, template: LabelledTemplate) -> JointModel:
@@ -180,14 +182,14 @@ def _search(
     base, state, _ = search_articulated(found.template, joints, clouds, rotations, states)
     copies = clouds.repeat_interleave(base.shape[1], dim=0)
     fit = InstanceFit(found.template, joints, base.flatten(0, 1), state.flatten(0, 1), generator)
-    fit.optimise(copies, SEARCH_CYCLES, shared=False)
+    fit.optimise(copies, _SEARCH_CYCLES, shared=False)
     # A hypothesis that leaves a part unexplained is to pay for it.
     error = fit.error(copies, softened=False).unflatten(0, base.shape[:2])
     best = error.argmin(dim=1)
     rows = torch.arange(len(clouds), device=clouds.device)
     base, state = (value.unflatten(0, error.shape)[rows, best] for value in fit.model()[1:])
     fit = InstanceFit(found.template, joints, base, state, generator)
-    fit.optimise(clouds, 2 * SEARCH_CYCLES, shared=False)
+    fit.optimise(clouds, 2 * _SEARCH_CYCLES, shared=False)
     return *fit.model()[1:], fit.error(clouds, softened=False)
 
 
@@ -209,7 +211,7 @@ def slab_cuts(template: Tensor, num_parts: int, generator: torch.Generator) -> l
     """[T] labels that part a slab from the rest, at either end of each principal axis; doors are slabs."""
     height = template @ _principal_frame(template)[:3, :3].T
     slabs = [sign * h for h in height.T for sign in (-1, 1)]
-    return [_cut_off(template, slab, share, num_parts, generator) for slab in slabs for share in SLABS]
+    return [_cut_off(template, slab, share, num_parts, generator) for slab in slabs for share in _SLABS]
 
 
 def unrest_cuts(aligned: Tensor, template: Tensor, num_parts: int, generator: torch.Generator) -> list[Tensor]:
@@ -219,11 +221,11 @@ def unrest_cuts(aligned: Tensor, template: Tensor, num_parts: int, generator: to
     joints = JointModel(KinematicChain(1, 0, (), ()), nothing, nothing, REVOLUTE)
     pose = torch.eye(4).to(template).expand(len(aligned), 4, 4)
     fit = InstanceFit(whole, joints, pose, template.new_zeros(len(aligned), 0), generator)
-    fit.optimise(aligned, SEARCH_CYCLES, shared=False)
+    fit.optimise(aligned, _SEARCH_CYCLES, shared=False)
     unrest = nearest_squared_distance(fit.posed(), aligned).sqrt().std(dim=0)
     near = torch.cdist(template, template).topk(min(24, len(template)), largest=False).indices
     unrest = unrest[near].mean(dim=1)
-    return [_cut_off(template, unrest, share, num_parts, generator) for share in UNREST]
+    return [_cut_off(template, unrest, share, num_parts, generator) for share in _UNREST]
 
 
 def _cut_off(template: Tensor, height: Tensor, share: float, num_parts: int, generator: torch.Generator) -> Tensor:
@@ -263,11 +265,11 @@ def split_template(
         if _smallest_share(labelled) >= options.min_share:
             found = fit_joints(labelled, pose, thin, joint_type)
             fits.append(InstanceFit(found.template, found.joints, found.base, found.state, generator))
-    for cycles, survivors in HALVING:
+    for cycles, survivors in _HALVING:
         for fit in fits:
             fit.optimise(aligned, cycles, keep=options.keep)
         fits = [
-            fit for fit in fits if _smallest_share(fit.template) >= options.min_share and _least_motion(fit) > STILL
+            fit for fit in fits if _smallest_share(fit.template) >= options.min_share and _least_motion(fit) > _STILL
         ]
         fits = sorted(fits, key=lambda fit: _trimmed(fit.error(aligned), options))[:survivors]
     if not fits:

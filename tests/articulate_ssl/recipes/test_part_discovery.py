@@ -4,9 +4,18 @@ from itertools import permutations
 
 import pytest
 import torch
-from articulated_objects import DRAWER, GLASSES, LAPTOP, clouds
+from articulated_objects import DRAWER, GLASSES, LAPTOP, OVEN, clouds
 
-from articulate_ssl.recipes.part_discovery import DiscoveryError, DiscoveryOptions, discover, random_split
+from articulate_ssl.recipes.part_discovery import (
+    DiscoveryError,
+    DiscoveryOptions,
+    discover,
+    random_split,
+    slab_cuts,
+    split_template,
+    unrest_cuts,
+)
+from datamodules.geometry import REVOLUTE
 
 
 def _agreement(found: torch.Tensor, true: torch.Tensor, num_parts: int) -> float:
@@ -66,6 +75,45 @@ def test_a_category_that_does_not_move_is_refused():
     small = DiscoveryOptions(clouds=6, search_clouds=6, split_clouds=6, points=64, starts=2, rounds=0)
     with pytest.raises(DiscoveryError, match="no part that moves in any of"):
         discover(copies, 2, LAPTOP[4], small)
+
+
+def test_slabs_lie_at_the_ends_of_a_box():
+    box = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 2.0, 3.0])
+    for parts in (2, 3):
+        labels = slab_cuts(box, parts, torch.Generator().manual_seed(0))
+        assert len(labels) == 12
+        for label in labels:
+            assert label.unique().tolist() == list(range(parts))
+            slab = box[label > 0]
+            assert 0.09 < len(slab) / len(box) < 0.21
+            # Thin along one axis, at one of its ends.
+            extent = (slab.amax(dim=0) - slab.amin(dim=0)) / box.amax(dim=0)
+            assert extent.min() < 0.3 and (extent > 0.9).sum() == 2
+
+
+def _ovens(count: int, proportions: float):
+    """Ovens with a small door, aligned: clouds, which points are the door's, joint states."""
+    data = clouds(OVEN, count=count, points=1536, resample=True, rotate=False, proportions=proportions, seed=1)
+    rows = torch.cat([(data.part == 0).nonzero()[:, 0], (data.part == 1).nonzero()[::4, 0]])
+    rows = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))]  # any prefix shows the whole
+    return data.points[:, rows], data.part[rows] == 1, data.state[:, 0]
+
+
+def test_the_points_of_a_small_moving_part_are_restless():
+    points, door, state = _ovens(count=16, proportions=0.1)
+    half_open = points[state.sub(1).abs().argmin()]
+    smallest, *_ = unrest_cuts(points, half_open, 2, torch.Generator().manual_seed(0))
+    assert door.float().mean() < 0.25
+    assert door[smallest == 1].float().mean() > 0.9
+
+
+def test_small_doors_of_boxes_of_other_proportions_are_found():
+    points, door, state = _ovens(count=24, proportions=0.25)
+    half_open = points[state.sub(1).abs().argmin()]
+    options = DiscoveryOptions(points=128, starts=4, jointed=2)
+    found = split_template(points, half_open, 2, REVOLUTE, options, torch.Generator().manual_seed(0))
+    assert _agreement(found.template.label, door.long(), 2) > 0.97
+    assert torch.corrcoef(torch.stack([found.state[:, 0], state]))[0, 1].abs() > 0.95
 
 
 def test_random_splits_have_k_nonempty_parts():
