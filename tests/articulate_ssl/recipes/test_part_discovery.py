@@ -12,10 +12,8 @@ from articulate_ssl.recipes.part_discovery import (
     discover,
     random_split,
     slab_cuts,
-    split_template,
     unrest_cuts,
 )
-from datamodules.geometry import REVOLUTE
 
 
 def _agreement(found: torch.Tensor, true: torch.Tensor, num_parts: int) -> float:
@@ -32,8 +30,8 @@ def _agreement(found: torch.Tensor, true: torch.Tensor, num_parts: int) -> float
 )
 def test_the_parts_are_those_that_move(design, agreement):
     num_parts, joint_type = len(design[0]), design[4]
-    data = clouds(design, count=24, points=256, resample=True, seed=1)
-    small = DiscoveryOptions(clouds=24, search_clouds=24, split_clouds=18, starts=8, rounds=1)
+    data = clouds(design, count=18, points=256, resample=True, seed=1)
+    small = DiscoveryOptions(clouds=18, search_clouds=18, split_clouds=14, starts=6, jointed=3, rounds=1, cycles=6)
     found = discover(data.points, num_parts, joint_type, small)
     assert _agreement(found.template.label, data.part, num_parts) > agreement
     if num_parts == 2:  # which of three parts is the root is not determined
@@ -91,29 +89,14 @@ def test_slabs_lie_at_the_ends_of_a_box():
             assert extent.min() < 0.3 and (extent > 0.9).sum() == 2
 
 
-def _ovens(count: int, proportions: float):
-    """Ovens with a small door, aligned: clouds, which points are the door's, joint states."""
-    data = clouds(OVEN, count=count, points=1536, resample=True, rotate=False, proportions=proportions, seed=1)
-    rows = torch.cat([(data.part == 0).nonzero()[:, 0], (data.part == 1).nonzero()[::4, 0]])
-    rows = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))]  # any prefix shows the whole
-    return data.points[:, rows], data.part[rows] == 1, data.state[:, 0]
-
-
 def test_the_points_of_a_small_moving_part_are_restless():
-    points, door, state = _ovens(count=16, proportions=0.1)
-    half_open = points[state.sub(1).abs().argmin()]
+    data = clouds(OVEN, count=16, points=768, resample=True, rotate=False, proportions=0.1, seed=1)
+    rows = torch.cat([(data.part == 0).nonzero()[:, 0], (data.part == 1).nonzero()[::4, 0]])
+    points, door = data.points[:, rows], data.part[rows] == 1
+    half_open = points[data.state[:, 0].sub(1).abs().argmin()]
     smallest, *_ = unrest_cuts(points, half_open, 2, torch.Generator().manual_seed(0))
     assert door.float().mean() < 0.25
     assert door[smallest == 1].float().mean() > 0.9
-
-
-def test_small_doors_of_boxes_of_other_proportions_are_found():
-    points, door, state = _ovens(count=24, proportions=0.25)
-    half_open = points[state.sub(1).abs().argmin()]
-    options = DiscoveryOptions(points=128, starts=4, jointed=2)
-    found = split_template(points, half_open, 2, REVOLUTE, options, torch.Generator().manual_seed(0))
-    assert _agreement(found.template.label, door.long(), 2) > 0.97
-    assert torch.corrcoef(torch.stack([found.state[:, 0], state]))[0, 1].abs() > 0.95
 
 
 def test_random_splits_have_k_nonempty_parts():
