@@ -6,6 +6,7 @@ Both console scripts, `lightning` and `articulate-ssl`, are this program.
 from __future__ import annotations
 
 import sys
+from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 
@@ -42,6 +43,7 @@ def _learn(arguments: list[str]) -> int:
 
     from articulate_ssl.inference.checkpoint_file import CheckpointError, read_checkpoint
     from articulate_ssl.module import ArticulatedPoseModule
+    from articulate_ssl.options import NetworkOptions
     from articulate_ssl.recipes.part_discovery import DiscoveryError
     from datamodules.articulated_data_module import ArticulatedDataModule
 
@@ -75,7 +77,8 @@ def _learn(arguments: list[str]) -> int:
         def _check_checkpoint(self, subcommand: str, path: str) -> None:
             """Weights of another category or network would load, or fail obscurely."""
             remembered = read_checkpoint(path)["hyper_parameters"]
-            if remembered.get("network") != self.model.hparams["network"]:
+            # An option that a checkpoint has never heard of had its default value.
+            if asdict(NetworkOptions()) | (remembered.get("network") or {}) != self.model.hparams["network"]:
                 raise CheckpointError(
                     f"{path}: trained with other network sizes; give `lightning {subcommand}` the same -c files and "
                     "--model.network options as `lightning fit`"

@@ -135,6 +135,22 @@ def test_a_separable_network_trains_from_the_command_line(run, workplace):
     assert load_module(checkpoint).network_options.separable
 
 
+def test_a_network_on_directions_trains_from_the_command_line(run, workplace):
+    sizes = ("--model.network.directions", "true", "--model.network.group_order", "60")
+    folder = f"--trainer.default_root_dir={workplace / 'directions'}"
+    assert run("fit", "-c", "laptop.yaml", "--model.recipe=paper", *sizes, folder)[0] == 0
+    (checkpoint,) = (workplace / "directions").rglob("last.ckpt")
+    assert "articulated.pointnet.to_group" in torch.load(checkpoint, weights_only=True)["state_dict"]
+    assert load_module(checkpoint).network_options.directions
+
+
+def test_a_checkpoint_older_than_an_option_is_one_with_its_default(run, workplace):
+    content = torch.load(workplace / "trained.ckpt", weights_only=True)
+    del content["hyper_parameters"]["network"]["directions"]
+    torch.save(content, workplace / "older.ckpt")
+    assert run("validate", "-c", "laptop.yaml", "--ckpt_path", "older.ckpt", "--model.recipe=paper")[0] == 0
+
+
 def test_a_checkpoint_of_other_network_sizes_is_refused(run):
     command = ("test", "-c", "laptop.yaml", "--ckpt_path", "trained.ckpt", "--model.network.head_dim=16")
     _refused(run(*command), "trained.ckpt", "network sizes")
