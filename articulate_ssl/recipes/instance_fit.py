@@ -112,7 +112,9 @@ class InstanceFit:
         """[n, T, 3] the template's points in every cloud."""
         linear, shift = self._maps()
         label = self.template.label[rows]
-        return torch.einsum("nmij,mj->nmi", linear[:, label], self.template.points[rows]) + shift[:, label]
+        # The gradient of index_select sums in a fixed order, that of indexing does not.
+        linear, shift = linear.index_select(1, label), shift.index_select(1, label)
+        return torch.einsum("nmij,mj->nmi", linear, self.template.points[rows]) + shift
 
     def _loss(self, clouds: Tensor, keep: float) -> Tensor:
         rows = self._draw(len(self.template.label), clouds.device)

@@ -41,9 +41,7 @@ from datamodules.geometry import REVOLUTE, invert_se3, se3, transform_points
 # Shares of the template that slabs and restless points take.
 _SLABS = (0.1, 0.2)
 _UNREST = (0.08, 0.15, 0.3)
-_HALVING = ((4, 8), (6, 3), (12, 1))  # cycles of descent on every split, and how many splits go on
 _STILL = 0.01  # in normalised units: what moves less is not a part
-_SEARCH_CYCLES = 4  # of descent on every candidate of a search
 
 log = logging.getLogger(__name__)
 
@@ -65,7 +63,8 @@ class DiscoveryOptions:
         starts: Random splits.
         jointed: The splits that explain the clouds best, to which joints are fitted.
         rounds: Rounds of articulated search and descent on labels and joints.
-        cycles: Cycles of descent in a round.
+        cuts: Also try slabs and restless points as splits.
+        cycles: Cycles of descent in a round, and on the last splits; a third of them on every split and candidate.
         keep: Share of the clouds, best fitted first, that labels and joints are solved from.
         min_share: Splits with a part smaller than this share of the template are discarded.
         seed: Of the random splits.
@@ -79,10 +78,16 @@ class DiscoveryOptions:
     starts: int = 24
     jointed: int = 6
     rounds: int = 3
+    cuts: bool = True
     cycles: int = 12
     keep: float = 0.75
     min_share: float = 0.05
     seed: int = 0
+
+    @property
+    def few_cycles(self) -> int:
+        """Cycles of descent where there are many candidates."""
+        return max(1, self.cycles // 3)
 
 
 @dataclass(frozen=True)
@@ -137,7 +142,7 @@ def discover(
     log.info("best split: error %.4f", found.error.mean())
 
     for step in range(options.rounds):
-        base, state, error = _search(found, few, rotations, generator)
+        base, state, error = _search(found, few, rotations, options.few_cycles, generator)
         kept = error.argsort()[: max(1, int(options.keep * len(few)))]
         fit = InstanceFit(found.template, found.joints, base[kept], state[kept], generator)
         fit.optimise(few[kept], options.cycles, keep=options.keep)
@@ -146,7 +151,7 @@ def discover(
             break
         found = _as_found(fit, few[kept])
         log.info("round %d: error %.4f of the kept clouds", step + 1, found.error.mean())
-    base, state, error = _search(found, clouds, rotations, generator)
+    base, state, error = _search(found, clouds, rotations, options.few_cycles, generator)
     return replace(found, base=base, state=state, error=error)
 
 
@@ -169,7 +174,7 @@ def _smallest_share(template: LabelledTemplate) -> float:
 
 
 def _search(
-    found: ArticulatedTemplate, clouds: Tensor, rotations: Tensor, generator: torch.Generator
+    found: ArticulatedTemplate, clouds: Tensor, rotations: Tensor, cycles: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Base poses, joint states and errors of the clouds: of the candidates, the one that fits best when stretched."""
     spread = 1.5 * found.state.std(dim=0)
@@ -182,14 +187,14 @@ def _search(
     base, state, _ = search_articulated(found.template, joints, clouds, rotations, states)
     copies = clouds.repeat_interleave(base.shape[1], dim=0)
     fit = InstanceFit(found.template, joints, base.flatten(0, 1), state.flatten(0, 1), generator)
-    fit.optimise(copies, _SEARCH_CYCLES, shared=False)
+    fit.optimise(copies, cycles, shared=False)
     # A hypothesis that leaves a part unexplained is to pay for it.
     error = fit.error(copies, softened=False).unflatten(0, base.shape[:2])
     best = error.argmin(dim=1)
     rows = torch.arange(len(clouds), device=clouds.device)
     base, state = (value.unflatten(0, error.shape)[rows, best] for value in fit.model()[1:])
     fit = InstanceFit(found.template, joints, base, state, generator)
-    fit.optimise(clouds, 2 * _SEARCH_CYCLES, shared=False)
+    fit.optimise(clouds, 2 * cycles, shared=False)
     return *fit.model()[1:], fit.error(clouds, softened=False)
 
 
@@ -214,14 +219,16 @@ def slab_cuts(template: Tensor, num_parts: int, generator: torch.Generator) -> l
     return [_cut_off(template, slab, share, num_parts, generator) for slab in slabs for share in _SLABS]
 
 
-def unrest_cuts(aligned: Tensor, template: Tensor, num_parts: int, generator: torch.Generator) -> list[Tensor]:
+def unrest_cuts(
+    aligned: Tensor, template: Tensor, num_parts: int, cycles: int, generator: torch.Generator
+) -> list[Tensor]:
     """[T] labels that part the points whose distance to the clouds varies most when nothing but the whole can move."""
     whole = LabelledTemplate(template, torch.zeros(len(template), dtype=torch.long, device=template.device), 1)
     nothing = template.new_zeros(0, 3)
     joints = JointModel(KinematicChain(1, 0, (), ()), nothing, nothing, REVOLUTE)
     pose = torch.eye(4).to(template).expand(len(aligned), 4, 4)
     fit = InstanceFit(whole, joints, pose, template.new_zeros(len(aligned), 0), generator)
-    fit.optimise(aligned, _SEARCH_CYCLES, shared=False)
+    fit.optimise(aligned, cycles, shared=False)
     unrest = nearest_squared_distance(fit.posed(), aligned).sqrt().std(dim=0)
     near = torch.cdist(template, template).topk(min(24, len(template)), largest=False).indices
     unrest = unrest[near].mean(dim=1)
@@ -257,7 +264,11 @@ def split_template(
         if _smallest_share(labelled) >= options.min_share:
             bodies.append((_trimmed(chamfer_l1(thin, labelled.posed(pose)), options), labelled, pose))
     bodies = [(labelled, pose) for _, labelled, pose in sorted(bodies, key=lambda body: body[0])[: options.jointed]]
-    for label in slab_cuts(template, num_parts, generator) + unrest_cuts(aligned, template, num_parts, generator):
+    cuts = []
+    if options.cuts:
+        cuts = slab_cuts(template, num_parts, generator)
+        cuts += unrest_cuts(aligned, template, num_parts, options.few_cycles, generator)
+    for label in cuts:
         bodies.append(_moving_bodies(template, label, num_parts, thin, relabelled=False))
 
     fits = []
@@ -265,7 +276,7 @@ def split_template(
         if _smallest_share(labelled) >= options.min_share:
             found = fit_joints(labelled, pose, thin, joint_type)
             fits.append(InstanceFit(found.template, found.joints, found.base, found.state, generator))
-    for cycles, survivors in _HALVING:
+    for cycles, survivors in ((options.few_cycles, 8), (max(1, options.cycles // 2), 3), (options.cycles, 1)):
         for fit in fits:
             fit.optimise(aligned, cycles, keep=options.keep)
         fits = [

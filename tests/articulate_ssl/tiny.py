@@ -26,7 +26,9 @@ NETWORK = NetworkOptions(
     shape_points=12,
 )
 # Not all of the synthetic set's 12 training clouds: a choice among them that reads a label would show in the weights.
-DISCOVERY = DiscoveryOptions(clouds=8, split_clouds=8, points=POINTS, starts=4, rounds=1, min_share=0.02)
+DISCOVERY = DiscoveryOptions(
+    clouds=8, split_clouds=8, points=POINTS, starts=4, jointed=2, rounds=1, cuts=False, cycles=1, min_share=0.02
+)
 
 
 def tiny_module(steps: int = 6, rigid_steps: int = 0, warmup_steps: int = 2, network=None, **options):

@@ -31,7 +31,9 @@ def _agreement(found: torch.Tensor, true: torch.Tensor, num_parts: int) -> float
 def test_the_parts_are_those_that_move(design, agreement):
     num_parts, joint_type = len(design[0]), design[4]
     data = clouds(design, count=18, points=256, resample=True, seed=1)
-    small = DiscoveryOptions(clouds=18, search_clouds=18, split_clouds=14, starts=6, jointed=3, rounds=1, cycles=6)
+    small = DiscoveryOptions(
+        clouds=18, search_clouds=18, split_clouds=14, starts=6, jointed=3, rounds=1, cuts=False, cycles=6
+    )
     found = discover(data.points, num_parts, joint_type, small)
     assert _agreement(found.template.label, data.part, num_parts) > agreement
     if num_parts == 2:  # which of three parts is the root is not determined
@@ -42,7 +44,9 @@ def test_the_parts_are_those_that_move(design, agreement):
 
 def test_the_same_clouds_give_the_same_parts_whatever_the_random_state():
     data = clouds(LAPTOP, count=6, resample=True)
-    small = DiscoveryOptions(clouds=6, search_clouds=6, split_clouds=6, points=64, starts=2, rounds=1)
+    small = DiscoveryOptions(
+        clouds=6, search_clouds=6, split_clouds=6, points=64, starts=2, rounds=1, cuts=False, cycles=2
+    )
     torch.manual_seed(1)
     first = discover(data.points, 2, LAPTOP[4], small)
     torch.manual_seed(2)
@@ -52,7 +56,9 @@ def test_the_same_clouds_give_the_same_parts_whatever_the_random_state():
 
 def test_three_parts_make_a_tree_of_two_joints():
     data = clouds(GLASSES, count=8, points=96, resample=True)
-    small = DiscoveryOptions(clouds=8, search_clouds=8, split_clouds=8, points=96, starts=4, rounds=0)
+    small = DiscoveryOptions(
+        clouds=8, search_clouds=8, split_clouds=8, points=96, starts=4, jointed=3, rounds=0, cuts=False, cycles=4
+    )
     found = discover(data.points, 3, GLASSES[4], small)
     chain = found.joints.chain
     assert found.state.shape == (8, 2) and {chain.root, *chain.child} == {0, 1, 2}
@@ -94,7 +100,7 @@ def test_the_points_of_a_small_moving_part_are_restless():
     rows = torch.cat([(data.part == 0).nonzero()[:, 0], (data.part == 1).nonzero()[::4, 0]])
     points, door = data.points[:, rows], data.part[rows] == 1
     half_open = points[data.state[:, 0].sub(1).abs().argmin()]
-    smallest, *_ = unrest_cuts(points, half_open, 2, torch.Generator().manual_seed(0))
+    smallest, *_ = unrest_cuts(points, half_open, 2, 4, torch.Generator().manual_seed(0))
     assert door.float().mean() < 0.25
     assert door[smallest == 1].float().mean() > 0.9
 
