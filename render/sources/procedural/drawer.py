@@ -137,7 +137,7 @@ def _drawer(p: DrawerParameters, low: float, high: float) -> Manifold:
         (inner - p.box_wall, box_top + 1e-3, d - p.front_thickness - OVERLAP),
     )
     middle = bottom + p.handle_height_share * (top - bottom)
-    return _with_handles(p, (shell - hollow) + front, middle, top)
+    return _with_handles(p, union([subtract(shell, [hollow]), front]), middle, top)
 
 
 def _with_handles(p: DrawerParameters, solid: Manifold, y: float, top: float) -> Manifold:
@@ -145,7 +145,7 @@ def _with_handles(p: DrawerParameters, solid: Manifold, y: float, top: float) ->
     if p.handle == "cut_out":
         half, reach = 0.3 * p.handle_length + 0.02, 0.028
         tool = rounded_box((-half, top - reach, d - 2 * p.front_thickness), (half, top + reach, d + 0.01), "z", 0.02)
-        return solid - tool
+        return subtract(solid, [tool])
     xs = (-0.24 * p.width, 0.24 * p.width) if p.two_handles else (0.0,)
     length = min(p.handle_length, (0.3 if p.two_handles else 0.5) * p.width)
     return union([solid, *(_handle(p, (x, y, d), length) for x in xs)])
@@ -172,4 +172,5 @@ def _cup(half: float, height: float) -> Manifold:
     outer = [(0.0, drop / 2), (height, -drop / 2 + 0.25 * drop), (height, -drop / 2), (-OVERLAP, -drop / 2)]
     shell = extrude(polygon([(-OVERLAP, drop / 2), *outer]), "x", -half, half)
     inner = [(0.0, drop / 2 - 1.5 * wall), (height - wall, -0.25 * drop - wall), (height - wall, -drop), (-0.01, -drop)]
-    return shell - extrude(polygon([(-0.01, drop / 2 - 1.5 * wall), *inner]), "x", -half + wall, half - wall)
+    hollow = extrude(polygon([(-0.01, drop / 2 - 1.5 * wall), *inner]), "x", -half + wall, half - wall)
+    return subtract(shell, [hollow])

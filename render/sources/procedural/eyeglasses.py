@@ -204,7 +204,7 @@ def _nose_pad(p: EyeglassesParameters, rim: CrossSection) -> Manifold:
     arm = Manifold.batch_hull(
         [Manifold.sphere(0.0009, 8).translate((x + dx, y, z)) for dx, z in ((0.0, 0.0), (-0.002, -0.0085))]
     )
-    return pad + arm
+    return union([pad, arm])
 
 
 def _barrel_halves(p: EyeglassesParameters) -> tuple[float, float, float]:
@@ -225,10 +225,10 @@ def _end_piece(p: EyeglassesParameters, attach: np.ndarray, pivot: np.ndarray) -
     back = box((low_x, y - half, pivot[2] + _CLEARANCE), (high_x, y + half, z))
     radius, middle, whole = _barrel_halves(p)
     cut = cylinder(pivot, "y", y - middle - _CLEARANCE, y + middle + _CLEARANCE, radius + _CLEARANCE, segments=16)
-    arm = Manifold.batch_hull([root, corner]) + Manifold.batch_hull([corner, back])
+    arm = union([Manifold.batch_hull([root, corner]), Manifold.batch_hull([corner, back])])
     spans = ((y - whole, y - middle - _CLEARANCE), (y + middle + _CLEARANCE, y + whole))
     barrels = [cylinder(pivot, "y", low, high, radius, segments=16) for low, high in spans]
-    return union([arm - cut, *barrels])
+    return union([subtract(arm, [cut]), *barrels])
 
 
 def _leg(p: EyeglassesParameters, pivot: np.ndarray) -> Manifold:
@@ -265,4 +265,4 @@ def _leg(p: EyeglassesParameters, pivot: np.ndarray) -> Manifold:
     ]
     inner = middle - _CLEARANCE
     barrel = cylinder(pivot, "y", height - inner, height + inner, radius, segments=16)
-    return subtract(loft(rings + pivot), cuts) + barrel
+    return union([subtract(loft(rings + pivot), cuts), barrel])

@@ -41,7 +41,7 @@ def knob(center: Sequence[float], radius: float, height: float, pointer: float |
     skirt = cylinder(center, "z", z - OVERLAP, z + 0.25 * height, radius)
     cap = cylinder(center, "z", z, z + height, 0.86 * radius, 0.76 * radius)
     if pointer is None:
-        return skirt + cap
+        return union([skirt, cap])
     ridge = box((-0.14 * radius, -0.72 * radius, 0.5 * height), (0.14 * radius, 0.72 * radius, 1.3 * height))
     return union([skirt, cap, ridge.rotate((0, 0, float(np.rad2deg(pointer)))).translate((x, y, z))])
 

@@ -154,7 +154,8 @@ def _base(p: LaptopParameters, pivot: np.ndarray, barrels: list[tuple[float, flo
     body = rounded_box((-w, 0, -d), (w, top, d), "y", p.corner, p.edge)
     if p.taper < 1:
         rise, slope = _underside(p, d + 1e-3), [(d + 1e-3, -1e-3), (_TAPER_START * p.depth, -1e-3)]
-        body -= extrude(polygon([*slope, (_TAPER_START * p.depth, 0), (d + 1e-3, rise)]), "x", -p.width, p.width)
+        wedge = polygon([*slope, (_TAPER_START * p.depth, 0), (d + 1e-3, rise)])
+        body = subtract(body, [extrude(wedge, "x", -p.width, p.width)])
     # The lid swings behind the hinge line: nothing of the base may stand there except below the barrels.
     notch = p.hinge_radius * 1.12
     cuts = [cylinder(pivot, "x", low - 4e-4, high + 4e-4, notch) for low, high in barrels]

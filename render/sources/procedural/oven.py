@@ -166,7 +166,8 @@ def _burners(p: OvenParameters, y: float) -> list[Manifold]:
         for j, z in enumerate((-0.22 * p.depth, 0.24 * p.depth)):
             radius = (0.13, 0.10)[(i + j) % 2] * min(p.width, p.depth)
             plate = cylinder((x, 0, z), "y", y - OVERLAP, y + 0.008, radius)
-            burners.append(plate - cylinder((x, 0, z), "y", y + 0.004, y + 0.02, 0.7 * radius))
+            dish = cylinder((x, 0, z), "y", y + 0.004, y + 0.02, 0.7 * radius)
+            burners.append(subtract(plate, [dish]))
             burners.append(cylinder((x, 0, z), "y", y, y + 0.010, 0.4 * radius))
     return burners
 

@@ -105,8 +105,8 @@ def _body(p: SafeParameters, front: float, pivot: np.ndarray) -> Manifold:
     w, h = p.width / 2, p.height
     inner = w - p.wall
     shell = rounded_box((-w, 0, -front), (w, h, front), "z", p.corner, 0.002)
-    shell -= box((-inner, p.wall, -front + p.wall), (inner, h - p.wall, front + 0.01))
-    solids = [shell]
+    inside = box((-inner, p.wall, -front + p.wall), (inner, h - p.wall, front + 0.01))
+    solids = [subtract(shell, [inside])]
     if p.shelf:
         y, reach = 0.48 * h, front - p.door_thickness - 0.07
         solids.append(box((-inner - OVERLAP, y, -front + p.wall - OVERLAP), (inner + OVERLAP, y + 0.006, reach)))
@@ -124,7 +124,7 @@ def _body_knuckle(p: SafeParameters, front: float, pivot: np.ndarray, low: float
     else:  # an angle from the side wall to the hinge line in front of it
         into_wall = -p.width / 2 + 0.002
         plate = box((x - _MOUNT, low, front - 0.02), (into_wall, high, front - 0.004))
-        mount = plate + box((x - _MOUNT, low, front - 0.02), (x + 0.002, high, z))
+        mount = union([plate, box((x - _MOUNT, low, front - 0.02), (x + 0.002, high, z))])
     return [cylinder(pivot, "y", low, high, _KNUCKLE_RADIUS, segments=16), mount]
 
 
@@ -146,7 +146,8 @@ def _door(p: SafeParameters, front: float, pivot: np.ndarray) -> Manifold:
         face = front + _GAP + t
         slab = rounded_box((-w + 0.001, 0.001, front + _GAP), (w - 0.001, h - 0.001, face), "z", p.corner, 0.003)
         plate_back = front - 0.35 * t
-        slab += _swinging_prism(left + 0.006, right, low + 0.004, high - 0.004, plate_back, front + 2 * _GAP, pivot)
+        back = _swinging_prism(left + 0.006, right, low + 0.004, high - 0.004, plate_back, front + 2 * _GAP, pivot)
+        slab = union([slab, back])
     solids = [slab, *_bolt_work(p, left, right, low, high, plate_back), *_fittings(p, left, right, face)]
     for bottom, top in _knuckles(p):
         x, _, z = pivot
@@ -212,7 +213,7 @@ def _keypad(center: tuple[float, float], face: float, scale: float) -> list[Mani
         for u in x + np.array([-0.6, 0.0, 0.6]) * w
         for v in y + np.array([-0.74, -0.38, -0.02, 0.34]) * h
     ]
-    return [plate - display, *keys]
+    return [subtract(plate, [display]), *keys]
 
 
 def _dial(center: tuple[float, float], face: float, radius: float) -> Manifold:
@@ -241,4 +242,4 @@ def _handle(p: SafeParameters, center: tuple[float, float, float], scale: float)
     spoke = cylinder((0, 0, 0.026), "x", 0.0, arm, r, 0.7 * r, segments=12)
     ball = Manifold.sphere(1.15 * r, 12).translate((arm, 0, 0.026))
     angles = (-25.0,) if p.handle == "lever" else (90.0, 210.0, 330.0)
-    return union([hub, rose, *((spoke + ball).rotate((0, 0, a)).translate((x, y, z)) for a in angles)])
+    return union([hub, rose, *(union([spoke, ball]).rotate((0, 0, a)).translate((x, y, z)) for a in angles)])

@@ -105,18 +105,28 @@ def loft(
 
 def union(solids: Sequence[Manifold]) -> Manifold:
     """Union of solids."""
-    return Manifold.batch_boolean(list(solids), OpType.Add)
+    return _evaluated(Manifold.batch_boolean(list(solids), OpType.Add))
 
 
 def subtract(solid: Manifold, tools: Sequence[Manifold]) -> Manifold:
     """Solid without all the tools."""
-    return Manifold.batch_boolean([solid, *tools], OpType.Subtract)
+    return _evaluated(Manifold.batch_boolean([solid, *tools], OpType.Subtract))
 
 
 def to_trimesh(solid: Manifold) -> trimesh.Trimesh:
     """Watertight triangle mesh of a solid."""
     mesh = solid.to_mesh64()
     return trimesh.Trimesh(np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts), process=False)
+
+
+def _evaluated(solid: Manifold) -> Manifold:
+    """The solid, computed now.
+
+    Left to itself, manifold3d flattens nested operations that nothing else refers to, so that the triangles depend on
+    whether a debugger, a profiler or a traceback happens to hold on to an operand. Hence no `+` and `-` on solids.
+    """
+    solid.num_tri()
+    return solid
 
 
 def _orient(solid: Manifold, axis: str) -> Manifold:

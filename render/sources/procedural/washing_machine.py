@@ -116,7 +116,7 @@ def _body(p: WashingMachineParameters, pivot: np.ndarray) -> Manifold:
     if p.panel_slope:
         low, run = p.height - p.panel_height, p.panel_height * p.panel_slope
         wedge = polygon([(front - run, p.height + 1e-3), (front + 1e-3, low), (front + 1e-3, p.height + 1e-3)])
-        body -= extrude(wedge, "x", -p.width, p.width)
+        body = subtract(body, [extrude(wedge, "x", -p.width, p.width)])
     return union([body, *_panel(p, front), *_lifters(p, front), *_brackets(p, pivot, front), *_stand(p, front)])
 
 
@@ -131,7 +131,7 @@ def _grooves(p: WashingMachineParameters, front: float) -> list[Manifold]:
         low, high = np.array([x - 1.6 * r, y - r, front - 0.003]), np.array([x + 1.6 * r, y + r, front + 1e-3])
         inset = np.array([0.004, 0.004, 0.0])
         outline = [rounded_box(low, high, "z", 0.006), rounded_box(low + inset, high - inset, "z", 0.004)]
-    return [*grooves, outline[0] - outline[1]]
+    return [*grooves, subtract(outline[0], outline[1:])]
 
 
 def _panel(p: WashingMachineParameters, front: float) -> list[Manifold]:
@@ -147,7 +147,7 @@ def _panel(p: WashingMachineParameters, front: float) -> list[Manifold]:
         grip = rounded_box(
             (low[0] + 0.02, low[1] - 0.01, raised - 0.003), (high[0] - 0.02, low[1] + 0.02, 0.1), "z", 0.004
         )
-        solids.append(front_plate - grip)
+        solids.append(subtract(front_plate, [grip]))
     right = 0.92 * w
     clear = p.knob_x + p.knob_radius + 0.025
     if right - clear > 0.08:
@@ -204,4 +204,4 @@ def _door(p: WashingMachineParameters, pivot: np.ndarray) -> Manifold:
     recess = rounded_box(
         (edge - 0.03, y - 0.05, front + t - 0.012), (edge - 0.012, y + 0.05, front + 2 * t), "z", 0.008
     )
-    return union([porthole, lug, knuckle]) - recess
+    return subtract(union([porthole, lug, knuckle]), [recess])
