@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from articulate_ssl.ops.chamfer import nearest_squared_distance
+from articulate_ssl.ops.chamfer import nearest_distance, nearest_squared_distance
 from articulate_ssl.registration import JointModel, LabelledTemplate
 from datamodules.geometry import se3
 
@@ -59,6 +59,21 @@ class InstanceFit:
         turn = self._base[:, :3, :3] @ roma.rotvec_to_rotmat(self._turn)
         base = se3(turn, self._base[:, :3, 3] + self._shift)
         return replace(self.joints, axis=axis, pivot=self._pivot), base, self._state
+
+    def rehinged(
+        self,
+        joint: int,
+        pivot: Tensor,  # [3]
+    ) -> InstanceFit:
+        """A copy in which a revolute joint's line goes through another point, and states follow as well as they can."""
+        joints, base, state = self.model()
+        pivots = joints.pivot.clone()
+        pivots[joint] = pivot
+        moved = replace(joints, pivot=pivots)
+        state = moved.read_states(self.template, joints.part_pose(base, state))
+        other = InstanceFit(self.template, moved, base, state, self._generator)
+        other._stretch = self._stretch.clone()
+        return other
 
     def optimise(
         self,
@@ -105,7 +120,7 @@ class InstanceFit:
         """
         posed = self.posed()
         rows = torch.linspace(0, posed.shape[1] - 1, min(queries, posed.shape[1])).long()
-        forward, backward = _distance(clouds[:, :queries], posed), _distance(posed[:, rows], clouds)
+        forward, backward = nearest_distance(clouds[:, :queries], posed), nearest_distance(posed[:, rows], clouds)
         return sum(_softened(d).mean(dim=1) if softened else d.mean(dim=1) for d in (forward, backward))
 
     def posed(self, rows: Tensor | slice = slice(None)) -> Tensor:
@@ -164,7 +179,7 @@ class InstanceFit:
         points, cost = self.template.points, []
         for part in range(self.template.num_parts):
             moved = torch.einsum("nij,mj->nmi", linear[kept, part], points) + shift[kept, part, None]
-            cost.append(nearest_squared_distance(moved, clouds[kept]).sqrt().clamp(max=_CAP).sum(dim=0))
+            cost.append(nearest_distance(moved, clouds[kept]).clamp(max=_CAP).sum(dim=0))
         self.template = replace(self.template, label=smooth_labels(points, torch.stack(cost, dim=1)))
         self._measure_parts()
 

@@ -1,12 +1,13 @@
 """Part discovery: find a category's parts and joints from unlabelled clouds alone, by registration.
 
-1. *Rigid alignment*: one typical cloud is registered to all others from every group rotation.
-2. *Splits*: cut the typical cloud into K pieces, register every piece to every aligned cloud on its own, and reduce the
+1. *Rigid alignment*: each of a few typical clouds is registered to all others from every group rotation.
+2. *Splits*: cut a typical cloud into K pieces, register every piece to every aligned cloud on its own, and reduce the
    motion between them to joints. Random cuts are first refined by giving each template point to the piece whose motion
    explains it best in all clouds: points that move together end up together. Slabs and restless points are taken as
    they are, since a small door would drown in that. From every split labels, joints and each cloud's proportions
    descend together (`instance_fit`), the better ones for longer. The winner reconstructs best with joints and
    proportions, which is what a wrong split cannot do.
+   So far every typical cloud is on its own; the one whose template explains all clouds best, found by a search, stays.
 3. *Rounds*: search every cloud again with the articulated template, from many orientations (this is what rights clouds
    that the rigid template fitted upside down), then descend again on the clouds that fit.
 
@@ -60,10 +61,12 @@ class DiscoveryOptions:
         search_clouds: Those on which labels and joints are solved again; all are registered in the end.
         points: Points per cloud and template in registration.
         dense_points: The same where it is decided between registrations.
-        starts: Random splits.
-        jointed: The splits that explain the clouds best, to which joints are fitted.
+        references: Typical clouds that are tried as the template.
+        starts: Random splits of each of them.
+        jointed: The random splits that explain the clouds best, to which joints are fitted.
         rounds: Rounds of articulated search and descent on labels and joints.
         cuts: Also try slabs and restless points as splits.
+        edge_hinges: Also try every revolute joint of the last splits along the edges of the part it moves.
         cycles: Cycles of descent in a round, and on the last splits; a third of them on every split and candidate.
         keep: Share of the clouds, best fitted first, that labels and joints are solved from.
         min_share: Splits with a part smaller than this share of the template are discarded.
@@ -71,14 +74,16 @@ class DiscoveryOptions:
     """
 
     clouds: int = 192
-    split_clouds: int = 48
-    search_clouds: int = 96
+    split_clouds: int = 24
+    search_clouds: int = 64
     points: int = 256
     dense_points: int = 1024
-    starts: int = 24
-    jointed: int = 6
-    rounds: int = 3
+    references: int = 3
+    starts: int = 12
+    jointed: int = 4
+    rounds: int = 2
     cuts: bool = True
+    edge_hinges: bool = True
     cycles: int = 12
     keep: float = 0.75
     min_share: float = 0.05
@@ -129,30 +134,35 @@ def discover(
     """
     clouds = clouds[:, : options.dense_points].contiguous()
     generator = torch.Generator().manual_seed(options.seed)
-    reference = clouds[choose_reference(clouds)]
     rotations = rotation_group(60).elements.to(clouds)
-    coarse = max(64, options.points // 2)
     few = clouds[:: max(1, len(clouds) // options.search_clouds)][: options.search_clouds]
-    rigid, error = register_rigid(reference[:coarse], few[:, :coarse], rotations, keep=1)
-    log.info("rigid alignment: median Chamfer-L1 %.4f", error[:, 0].median())
-
-    best_aligned = error[:, 0].argsort()[: options.split_clouds]
-    aligned = transform_points(invert_se3(rigid[best_aligned, 0]), few[best_aligned])
-    found = split_template(aligned, reference, num_parts, joint_type, options, generator)
-    log.info("best split: error %.4f", found.error.mean())
+    candidates = []
+    for reference in clouds[choose_references(clouds, options.references)]:
+        aligned = _aligned(reference, few, rotations, options)
+        found = split_template(aligned, reference, num_parts, joint_type, options, generator)
+        if found is not None:
+            candidates.append(_registered(found, few, rotations, options, generator))
+            log.info("template of %d: error %.4f", len(candidates), _trimmed(candidates[-1].error, options))
+    if not candidates:
+        raise DiscoveryError(
+            f"part discovery found no part that moves in any split of {options.references} clouds: they do not show "
+            f"{num_parts} parts that move on their own; check the category's number of parts, or allow more starts"
+        )
+    found = min(candidates, key=lambda candidate: _trimmed(candidate.error, options))
 
     for step in range(options.rounds):
-        base, state, error = _search(found, few, rotations, options.few_cycles, generator)
-        kept = error.argsort()[: max(1, int(options.keep * len(few)))]
-        fit = InstanceFit(found.template, found.joints, base[kept], state[kept], generator)
+        kept = found.error.argsort()[: max(1, int(options.keep * len(few)))]
+        fit = InstanceFit(found.template, found.joints, found.base[kept], found.state[kept], generator)
         fit.optimise(few[kept], options.cycles, keep=options.keep)
         if _smallest_share(fit.template) < options.min_share:
             log.warning("round %d lost a part; keeping the parts of the round before", step + 1)
             break
-        found = _as_found(fit, few[kept])
-        log.info("round %d: error %.4f of the kept clouds", step + 1, found.error.mean())
-    base, state, error = _search(found, clouds, rotations, options.few_cycles, generator)
-    return replace(found, base=base, state=state, error=error)
+        targets = few if step + 1 < options.rounds else clouds
+        found = _registered(_as_found(fit, few[kept]), targets, rotations, options, generator)
+        log.info("round %d: error %.4f", step + 1, _trimmed(found.error, options))
+    if len(found.error) < len(clouds):
+        found = _registered(found, clouds, rotations, options, generator)
+    return found
 
 
 def _as_found(fit: InstanceFit, clouds: Tensor) -> ArticulatedTemplate:
@@ -173,10 +183,14 @@ def _smallest_share(template: LabelledTemplate) -> float:
     return float(counts.min() / counts.sum())
 
 
-def _search(
-    found: ArticulatedTemplate, clouds: Tensor, rotations: Tensor, cycles: int, generator: torch.Generator
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Base poses, joint states and errors of the clouds: of the candidates, the one that fits best when stretched."""
+def _registered(
+    found: ArticulatedTemplate,
+    clouds: Tensor,
+    rotations: Tensor,
+    options: DiscoveryOptions,
+    generator: torch.Generator,
+) -> ArticulatedTemplate:
+    """The template registered to the clouds: of a search's candidates, the one that fits best when stretched."""
     spread = 1.5 * found.state.std(dim=0)
     # The middle, and every combination of either side.
     states = torch.cartesian_prod(*torch.stack([-spread, spread], dim=-1)).view(-1, len(spread))
@@ -187,21 +201,46 @@ def _search(
     base, state, _ = search_articulated(found.template, joints, clouds, rotations, states)
     copies = clouds.repeat_interleave(base.shape[1], dim=0)
     fit = InstanceFit(found.template, joints, base.flatten(0, 1), state.flatten(0, 1), generator)
-    fit.optimise(copies, cycles, shared=False)
+    fit.optimise(copies, options.few_cycles, shared=False)
     # A hypothesis that leaves a part unexplained is to pay for it.
     error = fit.error(copies, softened=False).unflatten(0, base.shape[:2])
     best = error.argmin(dim=1)
     rows = torch.arange(len(clouds), device=clouds.device)
     base, state = (value.unflatten(0, error.shape)[rows, best] for value in fit.model()[1:])
     fit = InstanceFit(found.template, joints, base, state, generator)
-    fit.optimise(clouds, 2 * cycles, shared=False)
-    return *fit.model()[1:], fit.error(clouds, softened=False)
+    fit.optimise(clouds, 2 * options.few_cycles, shared=False)
+    _, base, state = fit.model()
+    return replace(found, base=base, state=state, error=fit.error(clouds, softened=False))
 
 
-def choose_reference(clouds: Tensor) -> int:
-    """Index of the most typical cloud: the medoid of the sorted distances to the centre (invariant to rotation)."""
+def _aligned(reference: Tensor, clouds: Tensor, rotations: Tensor, options: DiscoveryOptions) -> Tensor:
+    """[n, N, 3] the clouds to which a template of one part fits best, in its frame."""
+    coarse = max(64, options.points // 2)
+    rigid, error = register_rigid(reference[:coarse], clouds[:, :coarse], rotations, keep=1)
+    log.info("rigid alignment: median Chamfer-L1 %.4f", error[:, 0].median())
+    best = error[:, 0].argsort()[: options.split_clouds]
+    return transform_points(invert_se3(rigid[best, 0]), clouds[best])
+
+
+def choose_references(clouds: Tensor, count: int) -> Tensor:
+    """Indices of typical clouds that differ: medoids of clusters of the sorted distances to the centre.
+
+    These are invariant to rotation, and tell an open object from a closed one.
+    """
     radius = (clouds - clouds.mean(dim=1, keepdim=True)).norm(dim=-1).sort(dim=1).values
-    return int(torch.cdist(radius, radius, p=1).sum(dim=1).argmin())
+    distance = torch.cdist(radius, radius, p=1)
+    # The first is the most typical of all, the others are ever less so.
+    medoids = distance.sum(dim=1).argsort()[torch.linspace(0, len(clouds) - 1, count).long()]
+    for _ in range(20):
+        nearest = distance[medoids].argmin(dim=0)
+        clusters = [(nearest == k).nonzero().squeeze(-1) for k in range(count)]
+        moved = [
+            c[distance[c][:, c].sum(dim=1).argmin()] if len(c) else m for c, m in zip(clusters, medoids, strict=True)
+        ]
+        if torch.equal(torch.stack(moved), medoids):
+            break
+        medoids = torch.stack(moved)
+    return medoids.unique()
 
 
 def random_split(template: Tensor, num_parts: int, generator: torch.Generator) -> Tensor:
@@ -250,11 +289,10 @@ def split_template(
     joint_type: int,
     options: DiscoveryOptions,
     generator: torch.Generator,
-) -> ArticulatedTemplate:
+) -> ArticulatedTemplate | None:
     """The split and joints that explain the clouds best when every cloud's object may stretch its parts.
 
-    Raises:
-        DiscoveryError: if in every start a part is lost or does not move.
+    None if in every start a part is lost or does not move.
     """
     thin = aligned[:, : options.points]
     bodies = []
@@ -276,19 +314,44 @@ def split_template(
         if _smallest_share(labelled) >= options.min_share:
             found = fit_joints(labelled, pose, thin, joint_type)
             fits.append(InstanceFit(found.template, found.joints, found.base, found.state, generator))
-    for cycles, survivors in ((options.few_cycles, 8), (max(1, options.cycles // 2), 3), (options.cycles, 1)):
-        for fit in fits:
-            fit.optimise(aligned, cycles, keep=options.keep)
-        fits = [
-            fit for fit in fits if _smallest_share(fit.template) >= options.min_share and _least_motion(fit) > _STILL
-        ]
-        fits = sorted(fits, key=lambda fit: _trimmed(fit.error(aligned), options))[:survivors]
-    if not fits:
-        raise DiscoveryError(
-            f"part discovery found no part that moves in any of {len(bodies)} starts: the clouds do not show "
-            f"{num_parts} parts that move on their own; check the category's number of parts, or allow more starts"
-        )
-    return _as_found(fits[0], aligned)
+    fits = _descended(fits, aligned, options.few_cycles, options)[:8]
+    fits = _descended(fits, aligned, max(1, options.cycles // 2), options)[:3]
+    if options.edge_hinges:
+        fits += [other for fit in fits for other in hinged_at_edges(fit)]
+        fits = _descended(fits, aligned, options.few_cycles, options)[:3]
+    fits = _descended(fits, aligned, options.cycles, options)
+    return _as_found(fits[0], aligned) if fits else None
+
+
+def _descended(fits: list[InstanceFit], clouds: Tensor, cycles: int, options: DiscoveryOptions) -> list[InstanceFit]:
+    """Those whose parts still move after a descent, best first."""
+    for fit in fits:
+        fit.optimise(clouds, cycles, keep=options.keep)
+    moving = [fit for fit in fits if _smallest_share(fit.template) >= options.min_share and _least_motion(fit) > _STILL]
+    return sorted(moving, key=lambda fit: _trimmed(fit.error(clouds), options))
+
+
+def hinged_at_edges(fit: InstanceFit) -> list[InstanceFit]:
+    """The fit with each joint line moved to each of the four edges of its part that run along it, states read anew.
+
+    A small turn about a distant line looks like a large turn about a near one, and descent does not lead from one to
+    the other.
+    """
+    joints = fit.model()[0]
+    others = []
+    if joints.joint_type != REVOLUTE:
+        return others
+    for j, child in enumerate(joints.chain.child):
+        points = fit.template.points[fit.template.label == child]
+        center = points.mean(dim=0)
+        across = torch.linalg.svd(joints.axis[j][None]).Vh[1:]  # [2, 3] a frame of the plane the part turns in
+        flat = (points - center) @ across.T
+        across = torch.linalg.eigh(flat.T @ flat).eigenvectors.T @ across
+        height = (points - center) @ across.T  # [m, 2]
+        for u in (height[:, 0].amin(), height[:, 0].amax()):
+            for v in (height[:, 1].amin(), height[:, 1].amax()):
+                others.append(fit.rehinged(j, center + torch.stack([u, v]) @ across))
+    return others
 
 
 def _least_motion(fit: InstanceFit) -> float:

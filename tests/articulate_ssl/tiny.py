@@ -27,7 +27,16 @@ NETWORK = NetworkOptions(
 )
 # Not all of the synthetic set's 12 training clouds: a choice among them that reads a label would show in the weights.
 DISCOVERY = DiscoveryOptions(
-    clouds=8, split_clouds=8, points=POINTS, starts=4, jointed=2, rounds=1, cuts=False, cycles=1, min_share=0.02
+    clouds=8,
+    split_clouds=8,
+    points=POINTS,
+    references=1,
+    starts=4,
+    jointed=2,
+    rounds=1,
+    cuts=False,
+    cycles=1,
+    min_share=0.02,
 )
 
 

@@ -8,6 +8,7 @@ from articulate_ssl.ops.chamfer import (
     _TILE_ELEMENTS,
     chamfer,
     hypothesis_distances,
+    nearest_distance,
     nearest_index,
     nearest_squared_distance,
 )
@@ -40,6 +41,7 @@ def test_nearest_index_is_right_across_tiles(monkeypatch, clouds):
     for budget in (1, 70, 400, 10_000, 10_000_000):
         monkeypatch.setitem(_TILE_ELEMENTS, "cpu", budget)
         assert torch.equal(nearest_index(points, target), expected)
+        torch.testing.assert_close(nearest_distance(points, target), torch.cdist(points, target).amin(dim=-1))
 
 
 def test_far_from_the_origin_float32_keeps_its_accuracy():

@@ -6,14 +6,19 @@ import pytest
 import torch
 from articulated_objects import DRAWER, GLASSES, LAPTOP, OVEN, clouds
 
+from articulate_ssl.kinematic_chain import KinematicChain
+from articulate_ssl.recipes.instance_fit import InstanceFit
 from articulate_ssl.recipes.part_discovery import (
     DiscoveryError,
     DiscoveryOptions,
+    choose_references,
     discover,
+    hinged_at_edges,
     random_split,
     slab_cuts,
     unrest_cuts,
 )
+from articulate_ssl.registration import JointModel, LabelledTemplate
 
 
 def _agreement(found: torch.Tensor, true: torch.Tensor, num_parts: int) -> float:
@@ -32,7 +37,7 @@ def test_the_parts_are_those_that_move(design, agreement):
     num_parts, joint_type = len(design[0]), design[4]
     data = clouds(design, count=18, points=256, resample=True, seed=1)
     small = DiscoveryOptions(
-        clouds=18, search_clouds=18, split_clouds=14, starts=6, jointed=3, rounds=1, cuts=False, cycles=6
+        clouds=18, search_clouds=18, split_clouds=14, references=1, starts=6, jointed=3, rounds=1, cuts=False, cycles=6
     )
     found = discover(data.points, num_parts, joint_type, small)
     assert _agreement(found.template.label, data.part, num_parts) > agreement
@@ -57,7 +62,16 @@ def test_the_same_clouds_give_the_same_parts_whatever_the_random_state():
 def test_three_parts_make_a_tree_of_two_joints():
     data = clouds(GLASSES, count=8, points=96, resample=True)
     small = DiscoveryOptions(
-        clouds=8, search_clouds=8, split_clouds=8, points=96, starts=4, jointed=3, rounds=0, cuts=False, cycles=4
+        clouds=8,
+        search_clouds=8,
+        split_clouds=8,
+        points=96,
+        references=1,
+        starts=4,
+        jointed=3,
+        rounds=0,
+        cuts=False,
+        cycles=4,
     )
     found = discover(data.points, 3, GLASSES[4], small)
     chain = found.joints.chain
@@ -77,7 +91,7 @@ def test_impossible_numbers_of_parts_are_refused():
 def test_a_category_that_does_not_move_is_refused():
     copies = clouds(LAPTOP, count=1).points.expand(6, -1, -1).contiguous()
     small = DiscoveryOptions(clouds=6, search_clouds=6, split_clouds=6, points=64, starts=2, rounds=0)
-    with pytest.raises(DiscoveryError, match="no part that moves in any of"):
+    with pytest.raises(DiscoveryError, match="no part that moves in any split of"):
         discover(copies, 2, LAPTOP[4], small)
 
 
@@ -103,6 +117,31 @@ def test_the_points_of_a_small_moving_part_are_restless():
     smallest, *_ = unrest_cuts(points, half_open, 2, 4, torch.Generator().manual_seed(0))
     assert door.float().mean() < 0.25
     assert door[smallest == 1].float().mean() > 0.9
+
+
+def test_references_are_typical_of_clusters_and_do_not_depend_on_orientation():
+    generator = torch.Generator().manual_seed(0)
+    ball = torch.nn.functional.normalize(torch.randn(20, 100, 3, generator=generator), dim=-1)
+    size = torch.cat([torch.linspace(0.9, 1.1, 9), torch.linspace(1.9, 2.1, 9), torch.tensor([0.5, 3.0])])
+    small, large = sorted(choose_references(ball * size[:, None, None], 2).tolist())
+    assert small in (3, 4, 5) and large in (12, 13, 14)
+    spheres = ball * size[:, None, None] * torch.tensor([1.0, 2.0, 3.0])
+    turned = spheres @ torch.linalg.qr(torch.randn(20, 3, 3, generator=generator)).Q
+    assert torch.equal(choose_references(spheres, 3), choose_references(turned, 3))
+    assert choose_references(spheres, 1).shape == (1,)
+
+
+def test_a_distant_joint_line_is_also_tried_along_the_edges_of_its_part():
+    data = clouds(LAPTOP, count=8, points=256)
+    across = torch.linalg.cross(data.axis, torch.tensor([[0.3, -0.5, 0.8]]))
+    distant = data.pivot + 0.5 * torch.nn.functional.normalize(across, dim=-1)
+    joints = JointModel(KinematicChain(2, 0, (0,), (1,)), data.axis, distant, LAPTOP[4])
+    template = LabelledTemplate(data.rest, data.part, 2)
+    fit = InstanceFit(template, joints, data.base, data.state, torch.Generator().manual_seed(0))
+    others = hinged_at_edges(fit)
+    distance = [torch.linalg.cross(o.model()[0].pivot - data.pivot, data.axis).norm() for o in others]
+    assert len(others) == 4 and min(distance) < 0.06 and max(distance) > 0.2
+    assert min(o.error(data.points).mean() for o in others) < fit.error(data.points).mean()
 
 
 def test_random_splits_have_k_nonempty_parts():
