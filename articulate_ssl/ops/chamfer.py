@@ -34,7 +34,8 @@ def nearest_distance(
 ) -> Tensor:  # [*, N]
     """Distance of every query point to its nearest target point, for choosing (no gradient).
 
-    Faster than finding which point it is. Distances below 1e-3 of the target's extent carry float32's cancellation error; see `nearest_squared_distance` for the exact ones.
+    Faster than finding which point it is. Distances below 1e-3 of the target's extent carry float32's
+    cancellation error; see `nearest_squared_distance` for the exact ones.
     """
     distance = query.new_empty(query.shape[:-1]).flatten(0, -2)
     for rows, square in _distance_tiles(query, target):
