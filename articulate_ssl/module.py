@@ -33,7 +33,7 @@ from articulate_ssl.options import (
 )
 from articulate_ssl.pose_estimation import PoseEstimator
 from articulate_ssl.prediction import Prediction
-from articulate_ssl.recipes.objective import PoseTarget, Terms, paper_terms, staged_terms, winning_hypothesis
+from articulate_ssl.recipes.objective import PoseTarget, Terms, paper_terms, staged_terms
 from articulate_ssl.recipes.part_discovery import ArticulatedTemplate, discover
 from datamodules.articulated_dataset import split_labels
 from datamodules.geometry import PRISMATIC, REVOLUTE, invert_se3, se3, transform_points
@@ -240,9 +240,8 @@ class ArticulatedPoseModule(LightningModule):
     def _paper_step(self, points: Tensor) -> Tensor:
         aligned, _ = self.estimator.align(points)
         losses = []
-        for hypotheses, _ in self.estimator.iterate(aligned):
-            winner, _ = winning_hypothesis(hypotheses, aligned, self.objective.unidirectional)
-            selected = hypotheses.select(winner)
+        for iteration in self.estimator.iterate(aligned):
+            selected = iteration.hypotheses.select(iteration.winner)
             terms = paper_terms(selected, aligned, self.objective)
             losses.append(terms.loss)
         self._track(terms, selected)
@@ -263,10 +262,10 @@ class ArticulatedPoseModule(LightningModule):
         losses = []
         target = PoseTarget(base, state)
         category = self.articulated.category_object()
-        for hypotheses, estimate in self.estimator.iterate(aligned):
-            start = torch.eye(3, device=device) if estimate is None else estimate.base[:, 0, :3, :3]
+        for iteration in self.estimator.iterate(aligned):
+            start = torch.eye(3, device=device) if iteration.start is None else iteration.start.base[:, 0, :3, :3]
             nearest = self.group.nearest(start.transpose(-1, -2) @ base[:, :3, :3])
-            selected = hypotheses.select(nearest)
+            selected = iteration.hypotheses.select(nearest)
             terms = staged_terms(selected, aligned, category, self.objective, target, follow_category=True)
             losses.append(terms.loss)
         self._track(terms, selected)
@@ -277,14 +276,13 @@ class ArticulatedPoseModule(LightningModule):
         aligned, _ = self.estimator.align(points)
         category = self.articulated.category_object()
         losses = []
-        for hypotheses, _ in self.estimator.iterate(aligned):
-            winner, before = winning_hypothesis(hypotheses, aligned, self.objective.unidirectional)
-            selected = hypotheses.select(winner)
+        for iteration in self.estimator.iterate(aligned):
+            selected = iteration.hypotheses.select(iteration.winner)
             target = None
             if self.objective.distillation:
                 start = selected.base[:, 0], selected.state[:, 0], selected.axis[:, 0]
                 base, state, after = self.estimator.register(selected, aligned, *start, (0.04, 0.02), 4)
-                better = after < before
+                better = after < iteration.distance.amin(dim=1)
                 target = PoseTarget(
                     torch.where(better[:, None, None], base, start[0].detach()),
                     torch.where(better[:, None], state, start[1].detach()),

@@ -12,6 +12,8 @@ Training takes the first two steps too; nothing here knows a loss or an optimise
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -24,11 +26,39 @@ from articulate_ssl.network.rigid_alignment import RigidAlignment
 from articulate_ssl.ops.chamfer import chamfer, hypothesis_distances
 from articulate_ssl.options import InferenceOptions, ObjectiveOptions
 from articulate_ssl.prediction import Prediction
-from articulate_ssl.recipes.objective import winning_hypothesis
 from articulate_ssl.registration import JointModel, LabelledTemplate, register_articulated
 from datamodules.geometry import invert_se3, se3, transform_points
 
 SCALE_STARTS = (-1.5, -0.75, 0.0, 0.75, 1.5)
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One pose estimation of clouds.
+
+    Attributes:
+        points: [B, N, 3] the clouds, aligned.
+        hypotheses: One per group element.
+        start: The estimate that the hypotheses are residuals to (the winner of the iteration before), or None.
+        unidirectional: Whether hypotheses are compared by the distance from the cloud to them only.
+    """
+
+    points: Tensor
+    hypotheses: Hypotheses
+    start: Hypotheses | None
+    unidirectional: bool
+
+    @cached_property
+    @torch.no_grad()
+    def distance(self) -> Tensor:
+        """d(X, Y^g) of every hypothesis, [B, G], without gradient."""
+        posed = self.hypotheses.posed().flatten(2, 3)
+        return hypothesis_distances(self.points, posed, bidirectional=not self.unidirectional)
+
+    @property
+    def winner(self) -> Tensor:
+        """argmin_g d(X, Y^g), [B]."""
+        return self.distance.argmin(dim=1)
 
 
 class PoseEstimator:
@@ -69,16 +99,15 @@ class PoseEstimator:
     def iterate(
         self,
         points: Tensor,  # [B, N, 3] aligned
-    ) -> Iterator[tuple[Hypotheses, Hypotheses | None]]:
-        """Hypotheses of every iteration, and the estimate each started from: the winner of the one before, or None."""
-        estimate, labels = None, None
-        for iteration in range(self.iterations):
-            hypotheses = self.articulated(points, estimate, labels)
-            yield hypotheses, estimate
-            if iteration + 1 < self.iterations:
-                winner, _ = winning_hypothesis(hypotheses, points, self.unidirectional)
-                estimate = hypotheses.select(winner)
-                labels = distances_to_parts(points, estimate.posed()[:, 0]).argmin(dim=-1)
+    ) -> Iterator[Iteration]:
+        """Pose estimations, each from the winner of the one before."""
+        start, labels = None, None
+        for number in range(self.iterations):
+            iteration = Iteration(points, self.articulated(points, start, labels), start, self.unidirectional)
+            yield iteration
+            if number + 1 < self.iterations:
+                start = iteration.hypotheses.select(iteration.winner)
+                labels = distances_to_parts(points, start.posed()[:, 0]).argmin(dim=-1)
 
     @torch.no_grad()
     def register(
@@ -121,13 +150,11 @@ class PoseEstimator:
             raise ValueError("a cloud has NaN or infinite points")
         with torch.autocast(points.device.type, enabled=False):
             aligned, pose = self.align(points[:, :num_points])
-            *_, (hypotheses, _) = self.iterate(aligned)
-            posed = hypotheses.posed().flatten(2, 3)
-            distance = hypothesis_distances(aligned, posed, bidirectional=not self.unidirectional)
+            *_, last = self.iterate(aligned)
             if self.inference.refine if refine is None else refine:
-                chosen = self._refine(hypotheses, transform_points(invert_se3(pose), points), distance)
+                chosen = self._refine(last.hypotheses, transform_points(invert_se3(pose), points), last.distance)
             else:
-                chosen = hypotheses.select(distance.argmin(dim=1))
+                chosen = last.hypotheses.select(last.winner)
             return self._prediction(chosen.at(pose[:, None] @ chosen.base, chosen.state), points)
 
     def predict_scan(

@@ -33,15 +33,11 @@ def distances_to_cloud(
     A part that owns no input point is compared with all of them.
     """
     target = points[:, None].expand(-1, posed.shape[1], -1, -1)
-    if labels is None:
-        index = nearest_index(posed, target)
-    else:
+    foreign = None
+    if labels is not None:
         foreign = labels[:, None] != torch.arange(posed.shape[1], device=points.device)[:, None]  # [B, K, N]
         foreign = foreign & ~foreign.all(dim=-1, keepdim=True)
-        # Masked distances, not moved points: points moved far off cost float32 all precision of the near ones.
-        distance = torch.cdist(posed.detach(), target.detach())
-        index = distance.masked_fill_(foreign[:, :, None], torch.inf).argmin(dim=-1)
-    return _gap(posed, target, index)
+    return _gap(posed, target, nearest_index(posed, target, foreign))
 
 
 def posterior_association(

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from articulate_ssl.directions import Directions, icosahedron_directions
 from articulate_ssl.groups import RotationGroup
+from articulate_ssl.ops.extreme_index import index_of_largest
 from articulate_ssl.ops.normalization import layer_norm_leaky_relu
 
 _SLOPE = 0.1
@@ -45,8 +46,7 @@ class SO3PointNet(nn.Module):
         hidden = hidden + features.flatten(0, 2) @ of_features.T
         hidden = layer_norm_leaky_relu(hidden, norm.weight, norm.bias, _SLOPE, norm.eps)
         hidden = last(hidden).view(*features.shape[:-1], -1)
-        # max_i w_i relu(h_i) = relu(max_i w_i h_i)
-        return largest_product(hidden.flatten(2), association).relu().unflatten(2, (features.shape[2], -1))
+        return largest_product(hidden.flatten(2), association).unflatten(2, (features.shape[2], -1))
 
 
 class DirectionPointNet(nn.Module):
@@ -79,19 +79,19 @@ class DirectionPointNet(nn.Module):
         first, norm, _, last, _ = self.perceptron
         hidden = first(torch.cat([features, torch.stack([along, away], dim=-1)], dim=-1))
         hidden = layer_norm_leaky_relu(hidden, norm.weight, norm.bias, _SLOPE, norm.eps)
-        pooled = largest_product(last(hidden).flatten(2), association).relu().unflatten(2, (features.shape[2], -1))
+        pooled = largest_product(last(hidden).flatten(2), association).unflatten(2, (features.shape[2], -1))
         ordered = sum((pooled @ w).index_select(2, i) for w, i in zip(self.to_group, self.order, strict=True))
         return layer_norm_leaky_relu(ordered, self.norm.weight, self.norm.bias, _SLOPE, self.norm.eps)
 
 
 def largest_product(
     features: Tensor,  # [B, M, D]
-    weight: Tensor,  # [B, M, K]
+    weight: Tensor,  # [B, M, K], not negative
 ) -> Tensor:  # [B, K, D]
-    """max over m of weight[m, k] features[m, d]: winners without gradient, then their products with gradient."""
+    """max over m of weight[m, k] relu(features[m, d]): winners without gradient, then their products with gradient."""
     with torch.no_grad():
-        index = torch.stack([(features * w[..., None]).max(dim=1).indices for w in weight.unbind(-1)], dim=1)
-    return features.gather(1, index) * weight.transpose(1, 2).gather(2, index)
+        index = torch.stack([index_of_largest(features * w[..., None], 1) for w in weight.unbind(-1)], dim=1)
+    return features.gather(1, index).relu() * weight.transpose(1, 2).gather(2, index)
 
 
 def part_pointnet(in_dim: int, out_dim: int, group: RotationGroup, directions: bool) -> SO3PointNet | DirectionPointNet:

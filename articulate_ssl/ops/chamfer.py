@@ -10,6 +10,8 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
+from articulate_ssl.ops.extreme_index import index_of_smallest
+
 _TILE_ELEMENTS = {"cpu": 2**18, "cuda": 2**27}  # entries of a distance matrix held at a time
 _TINY = 1e-12  # squared distances below have zero gradient instead of an infinite one
 
@@ -18,12 +20,15 @@ _TINY = 1e-12  # squared distances below have zero gradient instead of an infini
 def nearest_index(
     query: Tensor,  # [*, N, 3]
     target: Tensor,  # [*, M, 3]
+    excluded: Tensor | None = None,  # [*, M] bool
 ) -> Tensor:  # [*, N] int64
-    """Index of the target point nearest to every query point."""
+    """Index of the target point nearest to every query point, among those not `excluded`.
+
+    Of several that are equally near to about 1e-4 of the squared distance it is any (`index_of_smallest`).
+    """
     index = torch.empty(query.shape[:-1], dtype=torch.int64, device=query.device).flatten(0, -2)
-    for rows, square in _distance_tiles(query, target):
-        # Several times faster than argmin on a CPU.
-        index[rows] = square.min(dim=-1).indices
+    for rows, square in _distance_tiles(query, target, excluded):
+        index[rows] = index_of_smallest(square)
     return index.view(query.shape[:-1])
 
 
@@ -87,20 +92,30 @@ def hypothesis_distances(
     N = points.shape[1]
     left, right = _factors(points[:, None].expand(-1, H, -1, -1).flatten(0, 1), posed.flatten(0, 1))
     problems = min(B * H, max(1, _TILE_ELEMENTS[points.device.type] // (N * M)))
-    buffer = left.new_empty(problems * N * M)
-    result = left.new_empty(B * H)
-    for block in (slice(p, p + problems) for p in range(0, B * H, problems)):
-        square = buffer[: left[block].shape[0] * N * M].view(-1, N, M)
-        torch.bmm(left[block], right[block], out=square)
-        result[block] = _length(square.amin(dim=2), squared).mean(dim=-1)
+    buffer = left.new_empty(problems, N, M)
+    to_posed, to_points = left.new_empty(B * H, N), left.new_empty(B * H, M)
+    for start in range(0, B * H, problems):
+        block = slice(start, min(start + problems, B * H))
+        square = torch.bmm(left[block], right[block], out=buffer[: block.stop - start])
+        torch.amin(square, 2, out=to_posed[block])
         if bidirectional:
-            result[block] += _length(square.amin(dim=1), squared).mean(dim=-1)
+            torch.amin(square, 1, out=to_points[block])
+    result = _length(to_posed, squared).mean(dim=-1)
+    if bidirectional:
+        result += _length(to_points, squared).mean(dim=-1)
     return result.view(B, H)
 
 
-def _distance_tiles(query: Tensor, target: Tensor) -> Iterator[tuple[tuple[slice, slice], Tensor]]:
-    """Squared distances [b, n, M] of blocks of problems and query rows; every block overwrites the one before."""
+def _distance_tiles(
+    query: Tensor, target: Tensor, excluded: Tensor | None = None
+) -> Iterator[tuple[tuple[slice, slice], Tensor]]:
+    """Squared distances [b, n, M] of blocks of problems and query rows; every block overwrites the one before.
+
+    Excluded targets are infinitely far.
+    """
     left, right = _factors(query.flatten(0, -3), target.flatten(0, -3))
+    if excluded is not None:
+        right[:, -1].masked_fill_(excluded.flatten(0, -2), torch.inf)
     batch, N, _ = left.shape
     M = right.shape[2]
     budget = _TILE_ELEMENTS[query.device.type]

@@ -7,6 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from articulate_ssl.ops.extreme_index import indices_of_smallest
+
+_TILE_ELEMENTS = {"cpu": 2**16, "cuda": 2**27}  # distances held at a time: few enough to stay in cache on a CPU
 KERNEL_RADIUS = 0.7  # kernel points lie within this fraction of the ball's radius
 INFLUENCE = 0.5  # sigma / radius^2, the squared distance at which a kernel point's influence ends
 
@@ -64,13 +67,27 @@ def nearest_neighbors(
         raise ValueError(f"centers must be [{points.shape[0]}, M] indices of points, got {list(centers.shape)}")
     N = points.shape[1]
     queries = points if centers is None else points.gather(1, centers[..., None].expand(-1, -1, 3))
-    # Differences, not the expanded square: exact for coincident points and for clouds far from the origin.
-    distance = torch.cdist(queries, points, compute_mode="donot_use_mm_for_euclid_dist")
-    index = distance.topk(min(num_neighbors, N), dim=-1, largest=False, sorted=False).indices  # [B, M, n]
+    count, tile = min(num_neighbors, N), _TILE_ELEMENTS[points.device.type]
+    samples, rows = max(1, tile // (queries.shape[1] * N)), max(1, tile // N)
+    found = [
+        torch.cat([indices_of_smallest(_squared_distance(q, cloud), count) for q in some.split(rows, dim=1)], dim=1)
+        for some, cloud in zip(queries.split(samples), points.split(samples), strict=True)
+    ]
+    index = torch.cat(found)  # [B, M, n]
     neighbor = (
         points.transpose(1, 2).gather(2, index.flatten(1)[:, None].expand(-1, 3, -1)).unflatten(2, index.shape[1:])
     )
     return Neighbors(index, neighbor - queries.transpose(1, 2)[..., None], N)
+
+
+def _squared_distance(queries: Tensor, points: Tensor) -> Tensor:
+    """[B, M, N] by differences, not by the expanded square: exact for coincident points and far from the origin."""
+    pairs = zip(queries[..., None].unbind(2), points[:, None].unbind(3), strict=True)
+    first, *others = (q - p for q, p in pairs)
+    square = first.square_()
+    for difference in others:
+        square.addcmul_(difference, difference)
+    return square
 
 
 @torch.no_grad()

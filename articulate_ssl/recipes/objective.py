@@ -17,7 +17,7 @@ from articulate_ssl.losses.reconstruction import (
     whole_shape,
 )
 from articulate_ssl.network.articulated_network import CategoryObject, Hypotheses
-from articulate_ssl.ops.chamfer import hypothesis_distances, nearest_index
+from articulate_ssl.ops.chamfer import nearest_index
 from articulate_ssl.options import ObjectiveOptions
 
 
@@ -38,13 +38,6 @@ class PoseTarget(NamedTuple):
 
     base: Tensor  # [B, 4, 4]
     state: Tensor  # [B, J]
-
-
-def winning_hypothesis(hypotheses: Hypotheses, points: Tensor, unidirectional: bool) -> tuple[Tensor, Tensor]:
-    """argmin_g d(X, Y^g) and its value, [B] each, without gradient."""
-    posed = hypotheses.posed().flatten(2, 3)
-    distance = hypothesis_distances(points, posed, bidirectional=not unidirectional)
-    return distance.argmin(dim=1), distance.amin(dim=1)
 
 
 def spread_to_points(logits: Tensor, points: Tensor) -> Tensor:

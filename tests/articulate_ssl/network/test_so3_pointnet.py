@@ -85,4 +85,4 @@ def test_a_point_of_association_zero_is_not_seen():
 def test_largest_product():
     features = torch.tensor([[[1.0, -4.0], [2.0, -3.0]]])
     weight = torch.tensor([[[1.0, 0.1], [1.0, 0.9]]])
-    torch.testing.assert_close(largest_product(features, weight), torch.tensor([[[2.0, -3.0], [1.8, -0.4]]]))
+    torch.testing.assert_close(largest_product(features, weight), torch.tensor([[[2.0, 0.0], [1.8, 0.0]]]))

@@ -44,6 +44,18 @@ def test_nearest_index_is_right_across_tiles(monkeypatch, clouds):
         torch.testing.assert_close(nearest_distance(points, target), torch.cdist(points, target).amin(dim=-1))
 
 
+def test_excluded_points_are_not_nearest(monkeypatch, clouds):
+    points, target = (cloud.detach().float() for cloud in clouds)
+    excluded = torch.rand(2, 3, 70) < 0.8
+    distance = torch.cdist(points, target).masked_fill(excluded[:, :, None], torch.inf)
+    for budget in (70, 10_000_000):
+        monkeypatch.setitem(_TILE_ELEMENTS, "cpu", budget)
+        index = nearest_index(points, target, excluded)
+        assert not excluded.gather(2, index).any()
+        found = distance.gather(3, index[..., None]).squeeze(3)
+        torch.testing.assert_close(found, distance.amin(dim=-1), rtol=1e-4, atol=0)
+
+
 def test_far_from_the_origin_float32_keeps_its_accuracy():
     points, target = torch.rand(2, 1, 200, 3).unbind(0)
     moved = nearest_squared_distance(points + 100, target + 100).sqrt()
