@@ -110,4 +110,4 @@ class GroupAttentionPooling(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """[..., G, C] -> [..., C]; unchanged when the group index is permuted."""
-        return (features * self.logit(features).softmax(dim=-2)).sum(dim=-2)
+        return (self.logit(features).softmax(dim=-2).transpose(-1, -2) @ features).squeeze(-2)
