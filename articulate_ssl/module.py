@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import roma
 import torch
 from lightning.pytorch import LightningModule
 from torch import Tensor
@@ -31,6 +30,7 @@ from articulate_ssl.options import (
     ObjectiveOptions,
     ScheduleOptions,
 )
+from articulate_ssl.orientation import OrientationRange
 from articulate_ssl.pose_estimation import PoseEstimator
 from articulate_ssl.prediction import Prediction
 from articulate_ssl.recipes.objective import PoseTarget, Terms, paper_terms, staged_terms
@@ -56,9 +56,12 @@ class ArticulatedPoseModule(LightningModule):
         discovery: Effort of part discovery (staged recipe).
         inference: Refinement at test time.
         calibration_samples: Training clouds on which `lightning test` relates slots and canonical spaces to labels.
+        orientation_range: How far objects are turned from their mean orientation at most, in degrees; 180 stands for
+            any orientation, less where a camera is held upright.
 
     Raises:
-        ValueError: for an unknown recipe or joint type.
+        ValueError: for an unknown recipe or joint type, or if rigid alignment, which is for any orientation, is asked
+            for within a range.
     """
 
     def __init__(
@@ -74,6 +77,7 @@ class ArticulatedPoseModule(LightningModule):
         discovery: DiscoveryOptions = DiscoveryOptions(),  # noqa: B008
         inference: InferenceOptions = InferenceOptions(),  # noqa: B008
         calibration_samples: int = 128,
+        orientation_range: float = 180.0,
     ) -> None:
         super().__init__()
         if recipe not in RECIPES:
@@ -82,10 +86,14 @@ class ArticulatedPoseModule(LightningModule):
             raise ValueError(f"joint_type must be one of {sorted(JOINT_TYPES)}, got {joint_type!r}")
         if num_parts < 2:
             raise ValueError(f"num_parts must be at least 2, got {num_parts}")
+        self.orientation = OrientationRange(orientation_range)
+        if self.orientation.limited and schedule.rigid_steps:
+            raise ValueError("rigid_steps align clouds of any orientation: leave them 0, or orientation_range 180")
         groups = {"network": network, "objective": objective, "schedule": schedule}
         groups |= {"discovery": discovery, "inference": inference}
         plain = {"category": category, "num_parts": num_parts, "joint_type": joint_type, "state_range": state_range}
         plain |= {"recipe": recipe, "calibration_samples": calibration_samples}
+        plain |= {"orientation_range": orientation_range}
         self.save_hyperparameters(plain | {name: asdict(value) for name, value in groups.items()}, logger=False)
         self.category, self.num_parts, self.recipe = category, num_parts, recipe
         self.network_options, self.objective, self.schedule = network, objective, schedule
@@ -122,7 +130,7 @@ class ArticulatedPoseModule(LightningModule):
         )
         # Without pose awareness a second estimation would repeat the first.
         iterations = network.iterations if network.pose_aware else 1
-        self.estimator = PoseEstimator(self.articulated, self.rigid, iterations, objective, inference)
+        self.estimator = PoseEstimator(self.articulated, self.rigid, iterations, objective, inference, self.orientation)
         # Of training clouds' mean distance to their centre: how a scan of unknown scale is scaled.
         self.register_buffer("radius_mean", torch.tensor(0.0))
         self.register_buffer("radius_square", torch.tensor(0.0))
@@ -248,15 +256,15 @@ class ArticulatedPoseModule(LightningModule):
         return torch.stack(losses).mean()
 
     def _warmup_step(self, size: int) -> Tensor:
-        """Registered clouds under fresh rotations: poses are known, so the hypothesis nearest to them trains."""
+        """Registered clouds turned afresh: poses are known, so the hypothesis nearest to them trains."""
         device = self.device
         generator = torch.Generator().manual_seed(self.global_step * self.trainer.world_size + self.global_rank)
         index = torch.randint(len(self.registered["points"]), (size,), generator=generator)
-        rotation = roma.unitquat_to_rotmat(
-            torch.nn.functional.normalize(torch.randn(size, 4, generator=generator), dim=-1)
-        )
-        turn = se3(rotation, torch.zeros(size, 3)).to(device)
+        rotation = self.orientation.draw(size, generator).to(device)
         points, base, state = (self.registered[name][index].to(device) for name in ("points", "base", "state"))
+        if self.orientation.limited:
+            rotation = rotation @ base[:, :3, :3].mT  # to an orientation within the range
+        turn = se3(rotation, rotation.new_zeros(size, 3))
         aligned, pose = self.estimator.align(transform_points(turn, points))
         base = invert_se3(pose) @ turn @ base
         losses = []
@@ -323,7 +331,7 @@ class ArticulatedPoseModule(LightningModule):
         batches = [split_labels(b)[0] for b in self.trainer.datamodule.discovery_dataloader(options.clouds)]
         dense = torch.cat([b["dense_points"] for b in batches]).float()
         with torch.random.fork_rng(devices=[]):
-            found = discover(dense, self.num_parts, self.articulated.joint_type, options)
+            found = discover(dense, self.num_parts, self.articulated.joint_type, options, self.orientation)
         kept = found.error.argsort()[: max(1, int(options.keep * len(dense)))]
         self.registered = {
             "points": dense[kept, : self.num_points],

@@ -25,10 +25,12 @@ from articulate_ssl.network.articulated_network import ArticulatedNetwork, Hypot
 from articulate_ssl.network.rigid_alignment import RigidAlignment
 from articulate_ssl.ops.chamfer import chamfer, hypothesis_distances
 from articulate_ssl.options import InferenceOptions, ObjectiveOptions
+from articulate_ssl.orientation import OrientationRange
 from articulate_ssl.prediction import Prediction
 from articulate_ssl.registration import JointModel, LabelledTemplate, register_articulated
 from datamodules.geometry import invert_se3, se3, transform_points
 
+_FAR = 1e3  # more than any distance between normalised clouds
 SCALE_STARTS = (-1.5, -0.75, 0.0, 0.75, 1.5)
 
 
@@ -41,12 +43,14 @@ class Iteration:
         hypotheses: One per group element.
         start: The estimate that the hypotheses are residuals to (the winner of the iteration before), or None.
         unidirectional: Whether hypotheses are compared by the distance from the cloud to them only.
+        orientation: How far objects are turned; hypotheses turned further are the last to be chosen.
     """
 
     points: Tensor
     hypotheses: Hypotheses
     start: Hypotheses | None
     unidirectional: bool
+    orientation: OrientationRange
 
     @cached_property
     @torch.no_grad()
@@ -58,7 +62,12 @@ class Iteration:
     @property
     def winner(self) -> Tensor:
         """argmin_g d(X, Y^g), [B]."""
-        return self.distance.argmin(dim=1)
+        return self.leading(1)[:, 0]
+
+    def leading(self, count: int) -> Tensor:
+        """The hypotheses of the smallest d(X, Y^g), best first, [B, count]."""
+        outside = ~self.orientation.contains(self.hypotheses.base[..., :3, :3])
+        return (self.distance + _FAR * outside).topk(count, largest=False).indices
 
 
 class PoseEstimator:
@@ -70,6 +79,7 @@ class PoseEstimator:
         iterations: Pose estimations per cloud.
         objective: Whose reconstruction distance chooses among hypotheses.
         inference: Registration at test time.
+        orientation: How far objects are turned.
     """
 
     def __init__(
@@ -79,10 +89,11 @@ class PoseEstimator:
         iterations: int,
         objective: ObjectiveOptions,
         inference: InferenceOptions,
+        orientation: OrientationRange,
     ) -> None:
         self.articulated, self.rigid, self.iterations = articulated, rigid, iterations
         self.unidirectional, self.posterior_scale = objective.unidirectional, objective.posterior_scale
-        self.inference = inference
+        self.inference, self.orientation = inference, orientation
 
     def align(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Stage 0: clouds turned roughly to canonical orientation [B, N, 3], and the pose [B, 4, 4] that undoes it."""
@@ -103,10 +114,11 @@ class PoseEstimator:
         """Pose estimations, each from the winner of the one before."""
         start, labels = None, None
         for number in range(self.iterations):
-            iteration = Iteration(points, self.articulated(points, start, labels), start, self.unidirectional)
+            hypotheses = self.articulated(points, start, labels)
+            iteration = Iteration(points, hypotheses, start, self.unidirectional, self.orientation)
             yield iteration
             if number + 1 < self.iterations:
-                start = iteration.hypotheses.select(iteration.winner)
+                start = hypotheses.select(iteration.winner)
                 labels = distances_to_parts(points, start.posed()[:, 0]).argmin(dim=-1)
 
     @torch.no_grad()
@@ -152,7 +164,7 @@ class PoseEstimator:
             aligned, pose = self.align(points[:, :num_points])
             *_, last = self.iterate(aligned)
             if self.inference.refine if refine is None else refine:
-                chosen = self._refine(last.hypotheses, transform_points(invert_se3(pose), points), last.distance)
+                chosen = self._refine(last, transform_points(invert_se3(pose), points))
             else:
                 chosen = last.hypotheses.select(last.winner)
             return self._prediction(chosen.at(pose[:, None] @ chosen.base, chosen.state), points)
@@ -185,12 +197,11 @@ class PoseEstimator:
         best = int((prediction.reconstruction_error / extent).argmin())
         return prediction[best : best + 1], center, scales[best], batch[best].cpu().numpy()
 
-    def _refine(self, hypotheses: Hypotheses, points: Tensor, distance: Tensor) -> Hypotheses:
+    def _refine(self, last: Iteration, points: Tensor) -> Hypotheses:
         """The best of the leading hypotheses after articulated registration of the predicted shape."""
-        options = self.inference
-        leading = distance.topk(min(options.candidates, distance.shape[1]), largest=False).indices
-        candidates = hypotheses.select(leading)
-        count = leading.shape[1]
+        options, hypotheses = self.inference, last.hypotheses
+        count = min(options.candidates, hypotheses.base.shape[1])
+        candidates = hypotheses.select(last.leading(count))
         base, state, error = self.register(
             hypotheses,
             points.repeat_interleave(count, dim=0),

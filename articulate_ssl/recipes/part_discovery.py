@@ -26,6 +26,7 @@ from torch.nn import functional
 from articulate_ssl.groups import rotation_group
 from articulate_ssl.kinematic_chain import KinematicChain, extract_chain, pair_index
 from articulate_ssl.ops.chamfer import nearest_squared_distance
+from articulate_ssl.orientation import OrientationRange, mean_rotation
 from articulate_ssl.recipes.instance_fit import InstanceFit, smooth_labels
 from articulate_ssl.recipes.screw_fit import fit_screw
 from articulate_ssl.registration import (
@@ -100,7 +101,8 @@ class ArticulatedTemplate:
     """A category's labelled template with joints, registered to n clouds.
 
     Canonical object space has the template's principal axes as coordinate axes, so that the half-turns under which an
-    object nearly maps to itself are elements of the rotation group. State zero of every joint is near the clouds' mean.
+    object nearly maps to itself are elements of the rotation group; where orientations are limited, it is turned as the
+    clouds are in the mean. State zero of every joint is near the clouds' mean.
 
     Attributes:
         template: [T] labelled points.
@@ -126,8 +128,12 @@ def discover(
     num_parts: int,
     joint_type: int,
     options: DiscoveryOptions,
+    orientation: OrientationRange = OrientationRange(),  # noqa: B008 frozen
 ) -> ArticulatedTemplate:
     """Parts and joints of the category, registered to all the clouds.
+
+    Args:
+        orientation: How far objects are turned in the clouds.
 
     Raises:
         DiscoveryError: if no split into `num_parts` moving parts survives.
@@ -135,13 +141,14 @@ def discover(
     clouds = clouds[:, : options.dense_points].contiguous()
     generator = torch.Generator().manual_seed(options.seed)
     rotations = rotation_group(60).elements.to(clouds)
+    rotations = rotations[orientation.contains(rotations)]
     few = clouds[:: max(1, len(clouds) // options.search_clouds)][: options.search_clouds]
     candidates = []
     for reference in clouds[choose_references(clouds, options.references)]:
         aligned = _aligned(reference, few, rotations, options)
-        found = split_template(aligned, reference, num_parts, joint_type, options, generator)
+        found = split_template(aligned, reference, num_parts, joint_type, options, generator, orientation)
         if found is not None:
-            candidates.append(_registered(found, few, rotations, options, generator))
+            candidates.append(_registered(found, few, rotations, options, generator, orientation))
             log.info("template of %d: error %.4f", len(candidates), _trimmed(candidates[-1].error, options))
     if not candidates:
         raise DiscoveryError(
@@ -158,10 +165,10 @@ def discover(
             log.warning("round %d lost a part; keeping the parts of the round before", step + 1)
             break
         targets = few if step + 1 < options.rounds else clouds
-        found = _registered(_as_found(fit, few[kept]), targets, rotations, options, generator)
+        found = _registered(_as_found(fit, few[kept]), targets, rotations, options, generator, orientation)
         log.info("round %d: error %.4f", step + 1, _trimmed(found.error, options))
     if len(found.error) < len(clouds):
-        found = _registered(found, clouds, rotations, options, generator)
+        found = _registered(found, clouds, rotations, options, generator, orientation)
     return found
 
 
@@ -189,6 +196,7 @@ def _registered(
     rotations: Tensor,
     options: DiscoveryOptions,
     generator: torch.Generator,
+    orientation: OrientationRange,
 ) -> ArticulatedTemplate:
     """The template registered to the clouds: of a search's candidates, the one that fits best when stretched."""
     spread = 1.5 * found.state.std(dim=0)
@@ -204,13 +212,23 @@ def _registered(
     fit.optimise(copies, options.few_cycles, shared=False)
     # A hypothesis that leaves a part unexplained is to pay for it.
     error = fit.error(copies, softened=False).unflatten(0, base.shape[:2])
+    error = error.masked_fill(~orientation.contains(base[..., :3, :3]), torch.inf)
     best = error.argmin(dim=1)
     rows = torch.arange(len(clouds), device=clouds.device)
     base, state = (value.unflatten(0, error.shape)[rows, best] for value in fit.model()[1:])
     fit = InstanceFit(found.template, joints, base, state, generator)
     fit.optimise(clouds, 2 * options.few_cycles, shared=False)
     _, base, state = fit.model()
-    return replace(found, base=base, state=state, error=fit.error(clouds, softened=False))
+    found = replace(found, base=base, state=state, error=fit.error(clouds, softened=False))
+    return _turned_to_mean(found) if orientation.limited else found
+
+
+def _turned_to_mean(found: ArticulatedTemplate) -> ArticulatedTemplate:
+    """The same with the canonical space turned as the clouds are in the mean."""
+    turn = mean_rotation(found.base[:, :3, :3])
+    template = replace(found.template, points=found.template.points @ turn.T)
+    joints = replace(found.joints, axis=found.joints.axis @ turn.T, pivot=found.joints.pivot @ turn.T)
+    return replace(found, template=template, joints=joints, base=found.base @ se3(turn.T, turn.new_zeros(3)))
 
 
 def _aligned(reference: Tensor, clouds: Tensor, rotations: Tensor, options: DiscoveryOptions) -> Tensor:
@@ -289,6 +307,7 @@ def split_template(
     joint_type: int,
     options: DiscoveryOptions,
     generator: torch.Generator,
+    orientation: OrientationRange = OrientationRange(),  # noqa: B008 frozen
 ) -> ArticulatedTemplate | None:
     """The split and joints that explain the clouds best when every cloud's object may stretch its parts.
 
@@ -312,7 +331,7 @@ def split_template(
     fits = []
     for labelled, pose in bodies:
         if _smallest_share(labelled) >= options.min_share:
-            found = fit_joints(labelled, pose, thin, joint_type)
+            found = fit_joints(labelled, pose, thin, joint_type, orientation)
             fits.append(InstanceFit(found.template, found.joints, found.base, found.state, generator))
     fits = _descended(fits, aligned, options.few_cycles, options)[:8]
     fits = _descended(fits, aligned, max(1, options.cycles // 2), options)[:3]
@@ -403,6 +422,7 @@ def fit_joints(
     pose: Tensor,  # [n, K, 4, 4] freely registered parts
     clouds: Tensor,  # [n, N, 3]
     joint_type: int,
+    orientation: OrientationRange = OrientationRange(),  # noqa: B008 frozen
 ) -> ArticulatedTemplate:
     """Reduce free part poses to a tree of one-degree-of-freedom joints, in canonical object space (see above)."""
     num_parts = template.num_parts
@@ -434,6 +454,8 @@ def fit_joints(
         points[mine] = transform_points(into_object[part], points[mine])
 
     frame = _principal_frame(points)
+    if orientation.limited:
+        frame = se3(torch.eye(3).to(points), -points.mean(dim=0))
     points = transform_points(frame, points)
     axis = torch.stack(axes) @ frame[:3, :3].T
     pivot = transform_points(frame, torch.stack(pivots))
