@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import math
 import sys
+from itertools import product
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 
 from articulate_ssl.cli import main
+from render.camera import look_at_rotation
 from render.category import category_names, load_category
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 CATEGORIES = ("drawer", "eyeglasses", "laptop", "laptop_real", "oven", "safe", "washing_machine")
-PROFILES = ((), ("cpu",), ("gpu",), ("cpu", "smoke"))
+PROFILES = ((), ("cpu",), ("gpu",), ("cpu", "smoke"), ("cpu", "depth_camera"))
 
 
 @pytest.fixture(autouse=True)
@@ -70,6 +74,16 @@ def test_profiles_overlay_a_recipe(profiles: tuple[str, ...], capsys: pytest.Cap
     schedule = config["model"]["schedule"]
     assert schedule["steps"] == config["trainer"]["max_steps"]
     assert schedule["rigid_steps"] + schedule["warmup_steps"] < schedule["steps"]
+
+
+def test_the_depth_camera_profile_covers_the_views_of_every_category() -> None:
+    limit = yaml.safe_load((CONFIGS / "profiles" / "depth_camera.yaml").read_text())["model"]["orientation_range"]
+    for category in CATEGORIES:
+        view = _raw_spec(category)["view"]
+        bounds = [np.deg2rad(view[f"{angle}_deg"]) for angle in ("azimuth", "elevation", "roll")]
+        corners = Rotation.from_matrix([look_at_rotation(*angles) for angles in product(*bounds)])
+        farthest = (corners.mean().inv() * corners).magnitude().max()
+        assert np.rad2deg(farthest) < limit, category
 
 
 def _assert_contains(whole: object, part: object) -> None:
