@@ -211,12 +211,10 @@ class PoseEstimator:
             (options.coarse_scale, options.fine_scale),
             options.rounds,
         )
-        best = error.view(-1, count).argmin(dim=1)
-        chosen = candidates.select(best)
+        base, state, error = (value.unflatten(0, (-1, count)) for value in (base, state, error))
+        best = (error + _FAR * ~self.orientation.contains(base[..., :3, :3])).argmin(dim=1)
         rows = torch.arange(len(points), device=points.device)
-        return chosen.at(
-            base.view(-1, count, 4, 4)[rows, best][:, None], state.view(len(points), count, -1)[rows, best][:, None]
-        )
+        return candidates.select(best).at(base[rows, best][:, None], state[rows, best][:, None])
 
     def _prediction(self, chosen: Hypotheses, points: Tensor) -> Prediction:
         """Package one hypothesis per cloud."""
