@@ -83,6 +83,13 @@ def _learn(arguments: list[str]) -> int:
                     f"{path}: trained with other network sizes; give `lightning {subcommand}` the same -c files and "
                     "--model.network options as `lightning fit`"
                 )
+            degrees = remembered.get("orientation_range", 180.0)
+            if degrees != self.model.orientation.degrees:
+                raise CheckpointError(
+                    f"{path}: trained with --model.orientation_range {degrees:g}, not "
+                    f"{self.model.orientation.degrees:g}; give `lightning {subcommand}` the same -c files as "
+                    "`lightning fit` (configs/profiles/depth_camera.yaml sets it)"
+                )
             trained_on = remembered.get("category")
             if trained_on != self.model.category:
                 raise CheckpointError(

@@ -18,6 +18,7 @@ from torch import Tensor
 from articulate_ssl.inference.checkpoint_file import CheckpointError
 from articulate_ssl.inference.export import write_prediction
 from articulate_ssl.inference.point_cloud_io import PointCloudError, load_point_cloud
+from articulate_ssl.orientation import OrientationRange
 from articulate_ssl.prediction import Prediction
 
 BAD_INPUT = 2
@@ -29,10 +30,12 @@ class CloudPredictor(Protocol):
     Attributes:
         category: What it was trained on.
         state_range: [J, 2] lowest and highest joint state, as `Prediction.joint_state`.
+        orientation: How far objects were turned in the clouds that it was trained on.
     """
 
     category: str
     state_range: Tensor
+    orientation: OrientationRange
 
     def predict_cloud(
         self,
@@ -79,6 +82,8 @@ def run(args: argparse.Namespace) -> int:
     summary = json.loads((out / "prediction.json").read_text())
     for table in (_parts_table(summary), _joints_table(summary)):
         Console().print(table)
+    if module.orientation.limited:
+        print("trained on views of an upright camera: the scan is taken to have its axes (x right, y down, z forward)")
     print(f"reconstruction error {summary['reconstruction_error']:.4g} (in the unit of the scan)")
     print("wrote", *files, sep="\n  ")
     return 0

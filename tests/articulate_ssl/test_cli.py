@@ -156,6 +156,21 @@ def test_a_checkpoint_of_other_network_sizes_is_refused(run):
     _refused(run(*command), "trained.ckpt", "network sizes")
 
 
+def test_another_range_of_orientations_than_in_training_is_refused(run):
+    command = ("test", "-c", "laptop.yaml", "--ckpt_path", "trained.ckpt", "--model.recipe=paper")
+    _refused(run(*command, "--model.orientation_range=90"), "trained.ckpt", "orientation_range 180")
+
+
+def test_a_range_of_orientations_is_remembered_and_told(run, workplace, capsys):
+    command = ("fit", "-c", "laptop.yaml", "--model.recipe=paper", "--model.orientation_range=90")
+    assert run(*command, f"--trainer.default_root_dir={workplace / 'upright'}")[0] == 0
+    (checkpoint,) = (workplace / "upright").rglob("last.ckpt")
+    assert load_module(checkpoint).orientation.degrees == 90
+    np.save(workplace / "upright.npy", np.random.default_rng(0).normal(size=(500, 3)))
+    main(["predict", "upright.npy", "--ckpt", str(checkpoint), "--out", "upright-result"])
+    assert "y down" in capsys.readouterr().out
+
+
 def test_a_scan_gives_a_folder_of_results(run, workplace):
     np.save(workplace / "scan.npy", np.random.default_rng(0).normal(size=(500, 3)) * [30, 20, 2] + 100)
     assert run("predict", "scan.npy", "--ckpt", "trained.ckpt", "--out", "result")[0] == 0
