@@ -285,12 +285,13 @@ class ArticulatedPoseModule(LightningModule):
         category = self.articulated.category_object()
         losses = []
         for iteration in self.estimator.iterate(aligned):
-            selected = iteration.hypotheses.select(iteration.winner)
+            winner = iteration.winner
+            selected = iteration.hypotheses.select(winner)
             target = None
             if self.objective.distillation:
                 start = selected.base[:, 0], selected.state[:, 0], selected.axis[:, 0]
                 base, state, after = self.estimator.register(selected, aligned, *start, (0.04, 0.02), 4)
-                better = after < iteration.distance.amin(dim=1)
+                better = after < iteration.distance.gather(1, winner[:, None])[:, 0]
                 target = PoseTarget(
                     torch.where(better[:, None, None], base, start[0].detach()),
                     torch.where(better[:, None], state, start[1].detach()),
