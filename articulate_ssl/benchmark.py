@@ -35,6 +35,7 @@ from torch.nn.functional import leaky_relu
 from articulate_ssl.module import ArticulatedPoseModule
 from articulate_ssl.network.backbone import EquivariantBackbone
 from articulate_ssl.ops import chamfer, reference
+from articulate_ssl.ops.denormals import flush_denormals
 from articulate_ssl.ops.direction_convolution import direction_convolution
 from articulate_ssl.ops.group_convolution import group_convolution
 from articulate_ssl.ops.kernel_points import symmetric_kernel_points
@@ -455,6 +456,7 @@ def print_table(console: Console, machine: Machine, results: Sequence[Result]) -
     console.print(table)
 
 
+@flush_denormals()  # as the command line does
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, print one table, write bench.json and the plot."""
     parser = argparse.ArgumentParser(prog="python -m articulate_ssl.benchmark", description=__doc__.splitlines()[0])
