@@ -227,7 +227,7 @@ def operators(machine: Machine) -> list[Result]:
     results.append(Result(None, f"backbone, relative error ({machine.precision})", [error.item()]))
     runs = _forward_backward(lambda: original(points)), _forward_backward(fast_backbone)
     memory = [machine.peak_bytes(run) for run in reversed(runs)]
-    ratios, seconds = _ratio(machine, *runs, 2)
+    ratios, seconds = _ratio(machine, *runs, 3)
     results.append(Result("backbone_fwd_bwd_ratio", "backbone 1-64-128-512, forward + backward", ratios, "x"))
     results.append(Result(None, "  ours", seconds, "s"))
     results.append(Result("backbone_memory_ratio", "backbone, peak memory", [memory[1] / memory[0]], "x"))
