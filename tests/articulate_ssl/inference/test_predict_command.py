@@ -12,6 +12,7 @@ import torch
 from articulate_ssl.inference.checkpoint_file import CHECKPOINT_KEY, read_checkpoint
 from articulate_ssl.inference.point_cloud_io import normalise_cloud
 from articulate_ssl.inference.predict_command import add_arguments, run
+from articulate_ssl.orientation import OrientationRange
 from articulate_ssl.prediction import Prediction
 
 
@@ -20,6 +21,7 @@ class FakeModule(torch.nn.Module):
 
     category = "laptop"
     state_range = torch.tensor([[0.1, 1.7]])
+    orientation = OrientationRange()
 
     def predict_cloud(self, points, refine):
         self.refine = refine
