@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from datamodules.geometry import se3
+from articulate_ssl.geometry.se3 import se3
 from datamodules.manifest import Manifest
 from datamodules.shards import SHARD_ARRAYS, ShardError, read_shard, sha256_of
 

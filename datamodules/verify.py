@@ -17,7 +17,8 @@ import torch
 from rich.console import Console
 from rich.progress import track
 
-from datamodules.geometry import REVOLUTE, forward_kinematics, screw_motion
+from articulate_ssl.geometry.kinematic_chain import forward_kinematics
+from articulate_ssl.geometry.screw import REVOLUTE, screw_motion
 from datamodules.manifest import SPLITS, Manifest, ManifestError
 from datamodules.shards import ShardError, read_shard
 

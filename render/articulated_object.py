@@ -10,7 +10,8 @@ import numpy as np
 import torch
 import trimesh
 
-from datamodules.geometry import PRISMATIC, REVOLUTE, forward_kinematics, screw_motion
+from articulate_ssl.geometry.kinematic_chain import forward_kinematics
+from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE, screw_motion
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from typing import Any
 
 import yaml
 
-from datamodules.geometry import PRISMATIC, REVOLUTE
+from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE
 from render.articulated_object import ArticulatedObject, Joint
 
 

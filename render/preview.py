@@ -16,7 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from datamodules.geometry import REVOLUTE
+from articulate_ssl.geometry.screw import REVOLUTE
 from render.articulated_object import ArticulatedObject
 from render.category import CategorySpec, category_names, load_category
 from render.depth_renderer import RendererUnavailable

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from datamodules.geometry import PRISMATIC
+from articulate_ssl.geometry.screw import PRISMATIC
 from datamodules.shards import SHARD_ARRAYS, write_shard
 from render.articulated_object import ArticulatedObject
 from render.category import load_category

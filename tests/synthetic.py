@@ -8,7 +8,9 @@ import numpy as np
 import roma
 import torch
 
-from datamodules.geometry import PRISMATIC, REVOLUTE, forward_kinematics, screw_motion, se3, transform_points
+from articulate_ssl.geometry.kinematic_chain import forward_kinematics
+from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE, screw_motion
+from articulate_ssl.geometry.se3 import se3, transform_points
 from datamodules.manifest import Manifest, ShardEntry, set_folder
 from datamodules.shards import write_shard
 

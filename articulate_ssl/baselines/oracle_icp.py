@@ -23,14 +23,14 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from articulate_ssl.baselines.perfect_oracle import part_points, perfect_oracle
-from articulate_ssl.groups import rotation_group
+from articulate_ssl.geometry.rotation_group import rotation_group
+from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
+from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.metrics import ArticulatedPoseMetrics, calibrate
 from articulate_ssl.metrics.functional import nearest_index
 from articulate_ssl.metrics.report import write_report
-from articulate_ssl.prediction import Prediction
 from datamodules.articulated_data_module import ArticulatedDataModule
 from datamodules.articulated_dataset import ArticulatedDataset
-from datamodules.geometry import invert_se3, se3, transform_points
 
 registration = o3d.pipelines.registration
 SCREEN_ITERATIONS = 5
@@ -164,24 +164,10 @@ def oracle_icp(
     """
     truth = perfect_oracle(labels)
     points, num_parts = labels["points"], truth.num_parts
-    clouds = len(points)
-    pose = torch.eye(4, dtype=points.dtype).repeat(clouds, num_parts, 1, 1)
-    pose[..., :3, 3] = points.mean(1)[:, None]
-    shape = torch.stack([templates[0].parts] * clouds)  # [B, K, M, 3]
-    for b in range(clouds):
-        for k in range(num_parts):
-            observed = points[b][truth.part_id[b] == k]
-            if len(observed) == 0:
-                continue
-            results = [(*register_part(t.parts[k], observed, options), t) for t in templates]
-            best, _, template = min(results, key=lambda r: r[1])
-            pose[b, k] = torch.from_numpy(best.copy())
-            shape[b, k] = template.parts[k]
+    pose, shape = register_parts(points, truth.part_id, templates, options)
     posed = transform_points(pose, shape)  # [B, K, M, 3]
     distance = torch.stack([nearest_index(points, posed[:, k])[0] for k in range(num_parts)], dim=-1)  # [B, N, K]
     part_id = distance.argmin(-1)
-    none = points.new_zeros(clouds, 0)
-    no_index = torch.zeros(clouds, 0, dtype=torch.long)
     return replace(
         truth,
         part_id=part_id,
@@ -189,16 +175,49 @@ def oracle_icp(
         part_pose=pose,
         part_shape=shape,
         base_pose=pose[:, 0],
-        joint_parent=no_index,
-        joint_child=no_index,
-        joint_type=no_index,
-        joint_axis=none[..., None].expand(-1, -1, 3),
-        joint_pivot=none[..., None].expand(-1, -1, 3),
-        joint_state=none,
-        canonical_axis=none[..., None].expand(-1, -1, 3),
-        canonical_pivot=none[..., None].expand(-1, -1, 3),
         reconstruction_error=distance.amin(-1).mean(-1).to(points.dtype),
+        **_no_joints(points),
     )
+
+
+def register_parts(
+    points: Tensor,  # [B, N, 3]
+    part_id: Tensor,  # [B, N] true part of every point
+    templates: Sequence[Template],
+    options: Options,
+) -> tuple[Tensor, Tensor]:  # [B, K, 4, 4], [B, K, M, 3]
+    """Pose and shape of the template that fits each part of each cloud best; see `oracle_icp` for unobserved parts."""
+    clouds, num_parts = len(points), len(templates[0].parts)
+    pose = torch.eye(4, dtype=points.dtype).repeat(clouds, num_parts, 1, 1)
+    pose[..., :3, 3] = points.mean(1)[:, None]
+    shape = torch.stack([templates[0].parts] * clouds)
+    for b in range(clouds):
+        for k in range(num_parts):
+            observed = points[b][part_id[b] == k]
+            if len(observed) == 0:
+                continue
+            results = [(*register_part(t.parts[k], observed, options), t) for t in templates]
+            best, _, template = min(results, key=lambda r: r[1])
+            pose[b, k] = torch.from_numpy(best.copy())
+            shape[b, k] = template.parts[k]
+    return pose, shape
+
+
+def _no_joints(points: Tensor) -> dict[str, Tensor]:
+    """Every joint field of a prediction for clouds [B, N, 3], with J = 0."""
+    none = points.new_zeros(len(points), 0)
+    index = torch.zeros(len(points), 0, dtype=torch.long)
+    vector = none[..., None].expand(-1, -1, 3)
+    return {
+        "joint_parent": index,
+        "joint_child": index,
+        "joint_type": index,
+        "joint_axis": vector,
+        "joint_pivot": vector,
+        "joint_state": none,
+        "canonical_axis": vector,
+        "canonical_pivot": vector,
+    }
 
 
 def choose_views(
@@ -215,8 +234,58 @@ def choose_views(
     return [generator.choice(m, size=min(views, len(m)), replace=False) for m in members]
 
 
+def _score(
+    data: ArticulatedDataModule,
+    train: ArticulatedDataset,
+    templates: Sequence[Template],
+    options: Options,
+) -> tuple[dict, float]:
+    """Metrics over the test clouds, calibrated on training clouds; and the seconds that all predictions took."""
+    labels = train.__getitems__(np.linspace(0, len(train) - 1, min(len(train), 128)).astype(int).tolist())
+    metrics = ArticulatedPoseMetrics(calibrate(perfect_oracle(labels), labels))
+    seconds = 0.0
+    for batch in data.test_dataloader():
+        start = time.perf_counter()
+        prediction = oracle_icp(batch, templates, options)
+        seconds += time.perf_counter() - start
+        metrics.update(prediction, batch)
+    return metrics.compute(), seconds
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run Oracle ICP on the test split of a generated set and report it like a network."""
+    parser = _parser()
+    args = parser.parse_args(arguments)
+    partial = args.view == "partial"
+    protocol = args.protocol or "honest" if partial else None
+    try:
+        data, train = _open_data(args, protocol)
+    except ValueError as error:
+        parser.error(str(error))
+    options = Options(
+        initial_translations=10 if partial else 1,
+        correspondence_distance=args.distance,
+        screen=args.screen,
+        seed=args.seed,
+    )
+    views = choose_views(train.labels["instance"], args.templates, args.template_views if partial else 1, args.seed)
+    templates = [make_template(train.__getitems__(v.tolist()), options) for v in views]
+    result, seconds = _score(data, train, templates, options)
+    write_report(
+        args.out,
+        result,
+        category=args.category,
+        source=args.source,
+        protocol=protocol or "complete",
+        checkpoint=None,
+        seconds_per_cloud=seconds / result["samples"],
+        method="Oracle ICP",
+        screen=args.screen,
+        part_names=list(data.manifest.part_names),
+    )
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("python -m articulate_ssl.baselines.oracle_icp", description=main.__doc__)
     parser.add_argument("--root", default="data", help="folder that `make data` wrote to")
     parser.add_argument("--category", required=True)
@@ -231,53 +300,23 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--screen", type=int, default=None, help="not in the paper: refine only so many")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("build/oracle_icp"), help="folder of the report")
-    args = parser.parse_args(arguments)
-    partial = args.view == "partial"
-    protocol = args.protocol or "honest" if partial else None
-    try:
-        data = ArticulatedDataModule(
-            args.category,
-            args.root,
-            args.source,
-            args.view,
-            protocol,
-            num_points=args.points,
-            batch_size=8,
-            max_test_samples=args.samples,
-        )
-        data.setup("test")
-        train = ArticulatedDataset(data.folder, "train", num_points=args.points)
-    except ValueError as error:
-        parser.error(str(error))
-    options = Options(
-        initial_translations=10 if partial else 1,
-        correspondence_distance=args.distance,
-        screen=args.screen,
-        seed=args.seed,
+    return parser
+
+
+def _open_data(args: argparse.Namespace, protocol: str | None) -> tuple[ArticulatedDataModule, ArticulatedDataset]:
+    """The test clouds, and the training clouds of the same set."""
+    data = ArticulatedDataModule(
+        args.category,
+        args.root,
+        args.source,
+        args.view,
+        protocol,
+        num_points=args.points,
+        batch_size=8,
+        max_test_samples=args.samples,
     )
-    views = choose_views(train.labels["instance"], args.templates, args.template_views if partial else 1, args.seed)
-    templates = [make_template(train.__getitems__(v.tolist()), options) for v in views]
-    labels = train.__getitems__(np.linspace(0, len(train) - 1, min(len(train), 128)).astype(int).tolist())
-    metrics = ArticulatedPoseMetrics(calibrate(perfect_oracle(labels), labels))
-    seconds = 0.0
-    for batch in data.test_dataloader():
-        start = time.perf_counter()
-        prediction = oracle_icp(batch, templates, options)
-        seconds += time.perf_counter() - start
-        metrics.update(prediction, batch)
-    result = metrics.compute()
-    write_report(
-        args.out,
-        result,
-        category=args.category,
-        source=args.source,
-        protocol=protocol or "complete",
-        checkpoint=None,
-        seconds_per_cloud=seconds / result["samples"],
-        method="Oracle ICP",
-        screen=args.screen,
-        part_names=list(data.manifest.part_names),
-    )
+    data.setup("test")
+    return data, ArticulatedDataset(data.folder, "train", num_points=args.points)
 
 
 if __name__ == "__main__":

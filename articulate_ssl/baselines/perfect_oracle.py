@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
+from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
+from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.metrics.functional import nearest_index
-from articulate_ssl.prediction import Prediction
-from datamodules.geometry import invert_se3, se3, transform_points
 
 
 def part_points(

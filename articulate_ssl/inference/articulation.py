@@ -7,8 +7,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from articulate_ssl.prediction import Prediction
-from datamodules.geometry import PRISMATIC, forward_kinematics, invert_se3, screw_motion, transform_points
+from articulate_ssl.geometry.kinematic_chain import forward_kinematics
+from articulate_ssl.geometry.screw import PRISMATIC, screw_motion
+from articulate_ssl.geometry.se3 import invert_se3, transform_points
+from articulate_ssl.inference.prediction import Prediction
 
 
 def canonical_object(prediction: Prediction) -> Tensor:  # [B, K, M, 3]

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from articulate_ssl.ops.farthest_point import farthest_point_order
 from datamodules.atomic import atomic_write
 
 MIN_POINTS = 128
@@ -84,22 +85,6 @@ def normalise_cloud(
         normalised = np.random.default_rng(0).permutation(normalised)[:MESH_SAMPLES]
     order = farthest_point_order(normalised, min(num_points, len(normalised)))
     return np.resize(normalised[order], (num_points, 3)), np.asarray(center, dtype=np.float64), scale
-
-
-def farthest_point_order(
-    points: np.ndarray,  # [N, 3]
-    count: int,
-) -> np.ndarray:  # [count] indices
-    """Farthest-point sampling from the point farthest from the mean: any beginning of it is an even sample."""
-    columns = np.ascontiguousarray(points.T, dtype=np.float32)
-    squared = ((columns - columns.mean(axis=1, keepdims=True)) ** 2).sum(axis=0)
-    order = np.empty(count, dtype=np.int64)
-    order[0] = squared.argmax()
-    squared = np.full(len(points), np.inf, dtype=np.float32)
-    for i in range(1, count):
-        np.minimum(squared, ((columns - columns[:, order[i - 1], None]) ** 2).sum(axis=0), out=squared)
-        order[i] = squared.argmax()
-    return order
 
 
 def _check_cloud(path: Path, points: np.ndarray) -> None:

@@ -9,8 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from articulate_ssl.kinematic_chain import edge_marginals, pair_index
-from datamodules.geometry import REVOLUTE
+from articulate_ssl.geometry.kinematic_chain import edge_marginals, pair_index
+from articulate_ssl.geometry.screw import REVOLUTE
 
 
 def joint_line_points(

@@ -7,6 +7,9 @@ from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 
+from articulate_ssl.geometry.screw import REVOLUTE
+from articulate_ssl.geometry.se3 import transform_points
+from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.metrics.calibration import (
     Calibration,
     check_labels,
@@ -30,8 +33,6 @@ from articulate_ssl.metrics.functional import (
     translation_error,
 )
 from articulate_ssl.metrics.statistics import summarize
-from articulate_ssl.prediction import Prediction
-from datamodules.geometry import REVOLUTE, transform_points
 
 PER_PART = ("r_err_deg", "t_err", "flip_rate", "seg_miou", "legacy_r_err_deg", "legacy_t_err", "legacy_seg_miou")
 PER_JOINT = ("axis_err_deg", "pivot_err", "state_err", "legacy_pivot_err")

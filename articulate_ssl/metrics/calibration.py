@@ -14,6 +14,9 @@ import roma
 import torch
 from torch import Tensor
 
+from articulate_ssl.geometry.screw import REVOLUTE
+from articulate_ssl.geometry.se3 import invert_se3, transform_points
+from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.metrics.functional import (
     best_assignment,
     iou_matrix,
@@ -22,8 +25,6 @@ from articulate_ssl.metrics.functional import (
     translation_error,
     wrap_angle,
 )
-from articulate_ssl.prediction import Prediction
-from datamodules.geometry import REVOLUTE, invert_se3, transform_points
 
 SAMPLE_SIZE = 5
 HYPOTHESES = 1000

@@ -1,1 +1,1 @@
-"""The networks: equivariant backbone, part proposal, SO(3)-PointNet, heads, rigid alignment, articulated network."""
+"""The networks: equivariant backbone, part proposal, SO(3)-PointNet, heads, articulated network, rigid alignment."""

@@ -7,12 +7,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from articulate_ssl.directions import Directions, icosahedron_directions, kernel_orbits, kernel_rings
-from articulate_ssl.groups import RotationGroup, rotation_group
+from articulate_ssl.geometry.directions import Directions, icosahedron_directions, kernel_orbits, kernel_rings
+from articulate_ssl.geometry.kernel_points import KernelPoints, symmetric_kernel_points
+from articulate_ssl.geometry.rotation_group import RotationGroup, rotation_group
+from articulate_ssl.network.options import NetworkOptions
 from articulate_ssl.network.pose_aware_convolution import canonicalize
 from articulate_ssl.ops.direction_convolution import constant_direction_convolution, direction_convolution
 from articulate_ssl.ops.group_convolution import group_convolution
-from articulate_ssl.ops.kernel_points import KernelPoints, symmetric_kernel_points
 from articulate_ssl.ops.neighborhood import Neighborhood, Neighbors, correlate, nearest_neighbors
 from articulate_ssl.ops.normalization import layer_norm_leaky_relu
 from articulate_ssl.ops.separable_group_convolution import separable_group_convolution
@@ -191,6 +192,21 @@ class EquivariantBackbone(nn.Module):
             self.blocks = nn.ModuleList(
                 GroupConvolutionBlock(*c, self.group, kernel, intra, separable) for c in channels
             )
+
+    @staticmethod
+    def of(options: NetworkOptions) -> EquivariantBackbone:
+        """The backbone that a configuration asks for."""
+        return EquivariantBackbone(
+            options.group_order,
+            options.dims,
+            options.radii,
+            options.num_neighbors,
+            options.num_kernel_points,
+            options.num_centers,
+            intra=options.intra,
+            separable=options.separable,
+            directions=options.directions,
+        )
 
     def neighborhoods(
         self,

@@ -15,11 +15,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from articulate_ssl.groups import RotationGroup
+from articulate_ssl.geometry.kernel_points import KernelPoints
+from articulate_ssl.geometry.rotation_group import RotationGroup
+from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.ops.group_convolution import group_convolution
-from articulate_ssl.ops.kernel_points import KernelPoints
 from articulate_ssl.ops.neighborhood import build_neighborhood
-from datamodules.geometry import invert_se3, transform_points
 
 
 def canonicalize(

@@ -13,8 +13,12 @@ import roma
 import torch
 from torch import Tensor, nn
 
-from articulate_ssl.groups import RotationGroup
+from articulate_ssl.geometry.rotation_group import rotation_group
+from articulate_ssl.network.backbone import EquivariantBackbone
+from articulate_ssl.network.options import NetworkOptions
 from articulate_ssl.network.so3_pointnet import GroupAttentionPooling, part_pointnet
+
+_FLOW_BOUND = 0.05  # what an instance adds at most: stage 0 needs orientations, not shapes
 
 
 class RigidHypotheses(NamedTuple):
@@ -32,28 +36,18 @@ class RigidHypotheses(NamedTuple):
 class RigidAlignment(nn.Module):
     """Whole-shape EPN auto-encoder: an invariant canonical shape, and one residual pose per group element."""
 
-    def __init__(
-        self,
-        backbone: nn.Module,
-        group: RotationGroup,
-        in_dim: int,
-        dim: int,
-        shape_points: int,
-        flow_bound: float = 0.05,
-        directions: bool = False,
-    ) -> None:
-        """Args: backbone with `in_dim` output channels; hidden width; points of the canonical shape; flow bound."""
+    def __init__(self, options: NetworkOptions, num_points: int) -> None:
+        """Args: sizes; points of the canonical shape."""
         super().__init__()
-        elements = group.elements
-        self.register_buffer("elements", elements, persistent=False)
-        self.backbone = backbone
-        self.pointnet = part_pointnet(in_dim, dim, group, directions)
+        group, dim = rotation_group(options.group_order), options.head_dim
+        self.register_buffer("elements", group.elements, persistent=False)
+        self.backbone = EquivariantBackbone.of(options)
+        self.pointnet = part_pointnet(options.dims[-1], dim, group, options.directions)
         self.pool = GroupAttentionPooling(dim)
         self.pose_head = nn.Sequential(nn.Linear(dim, dim), nn.LeakyReLU(0.1), nn.Linear(dim, 6))
-        self.flow_head = nn.Sequential(nn.Linear(dim, dim), nn.LeakyReLU(0.1), nn.Linear(dim, 3 * shape_points))
-        self.flow_bound = flow_bound
+        self.flow_head = nn.Sequential(nn.Linear(dim, dim), nn.LeakyReLU(0.1), nn.Linear(dim, 3 * num_points))
         self.mixed_precision = False  # of the backbone; geometry needs full precision
-        self.template = nn.Parameter(0.2 * torch.randn(shape_points, 3))
+        self.template = nn.Parameter(0.2 * torch.randn(num_points, 3))
         for head in (self.pose_head, self.flow_head):
             nn.init.normal_(head[-1].weight, std=1e-3)
             nn.init.zeros_(head[-1].bias)
@@ -73,4 +67,4 @@ class RigidAlignment(nn.Module):
         elements = self.elements.to(residual)
         rotation = elements @ roma.rotvec_to_rotmat(residual[..., :3])
         translation = torch.einsum("gij,bgj->bgi", elements, residual[..., 3:]) + mean
-        return RigidHypotheses(rotation, translation, self.template + self.flow_bound * flow.tanh())
+        return RigidHypotheses(rotation, translation, self.template + _FLOW_BOUND * flow.tanh())

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from articulate_ssl.directions import Directions, icosahedron_directions
-from articulate_ssl.groups import RotationGroup
+from articulate_ssl.geometry.directions import Directions, icosahedron_directions
+from articulate_ssl.geometry.rotation_group import RotationGroup
 from articulate_ssl.ops.extreme_index import index_of_largest
 from articulate_ssl.ops.normalization import layer_norm_leaky_relu
 

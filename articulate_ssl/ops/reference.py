@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import layer_norm, leaky_relu
 
-from articulate_ssl.groups import RotationGroup
-from articulate_ssl.ops.kernel_points import KernelPoints
+from articulate_ssl.geometry.kernel_points import KernelPoints
+from articulate_ssl.geometry.rotation_group import RotationGroup
+from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.ops.neighborhood import INFLUENCE, KERNEL_RADIUS, Neighborhood
-from datamodules.geometry import invert_se3, transform_points
 
 
 def group_convolution(

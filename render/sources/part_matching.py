@@ -12,7 +12,7 @@ from math import pi
 
 import numpy as np
 
-from datamodules.geometry import PRISMATIC, REVOLUTE
+from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE
 from render.articulated_object import ArticulatedObject
 from render.category import CategorySpec
 from render.sources.link_graph import LinkGraph, LinkJoint, merge_links

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import trimesh
 
-from datamodules.geometry import PRISMATIC, REVOLUTE
+from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE
 from render.articulated_object import ArticulatedObject
 from render.sources import Source
 from render.sources.dataset_folder import find_instances, read_json

@@ -20,7 +20,7 @@ import numpy as np
 import trimesh
 import yourdfpy
 
-from datamodules.geometry import PRISMATIC, REVOLUTE
+from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE
 from render.articulated_object import ArticulatedObject
 from render.sources import Source
 from render.sources.link_graph import FIXED, Link, LinkGraph, LinkJoint, tree_order

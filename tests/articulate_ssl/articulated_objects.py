@@ -8,7 +8,11 @@ import roma
 import torch
 from torch import Tensor
 
-from datamodules.geometry import PRISMATIC, REVOLUTE, forward_kinematics, screw_motion, se3, transform_points
+from articulate_ssl.geometry.kinematic_chain import KinematicChain, forward_kinematics
+from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE, screw_motion
+from articulate_ssl.geometry.se3 import se3, transform_points
+from articulate_ssl.shape.articulated_shape import ArticulatedShape
+from articulate_ssl.shape.joints import Joints
 
 
 class Clouds(NamedTuple):
@@ -105,3 +109,10 @@ def clouds(
     center = posed.mean(dim=1)
     base = se3(rotation, -(rotation @ center[..., None]).squeeze(-1))
     return Clouds(transform_points(base, posed), rest, part, base, state, axis, pivot)
+
+
+def true_shape(design, data: Clouds) -> ArticulatedShape:
+    """The object of the clouds: points, parts and joints at rest."""
+    K = len(design[0])
+    chain = KinematicChain(K, 0, design[1], tuple(range(1, K)))
+    return ArticulatedShape(data.rest, data.part, Joints(chain, data.axis, data.pivot, design[4]))

@@ -10,8 +10,10 @@ from pathlib import Path
 import torch
 from lightning.pytorch import Trainer
 
-from articulate_ssl.module import ArticulatedPoseModule
-from articulate_ssl.options import DiscoveryOptions, NetworkOptions, ScheduleOptions
+from articulate_ssl.discovery.options import DiscoveryOptions
+from articulate_ssl.network.options import NetworkOptions
+from articulate_ssl.training.module import ArticulatedPoseModule
+from articulate_ssl.training.schedule import ScheduleOptions
 from datamodules.articulated_data_module import ArticulatedDataModule
 
 POINTS = 48
@@ -34,7 +36,7 @@ DISCOVERY = DiscoveryOptions(
     starts=4,
     jointed=2,
     rounds=1,
-    cuts=False,
+    proposals=["random_cuts"],
     cycles=1,
     min_share=0.02,
 )

@@ -10,8 +10,9 @@ import torch
 from synthetic import write_synthetic_set
 from torch.testing import assert_close
 
+from articulate_ssl.geometry.screw import PRISMATIC, screw_motion
+from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from datamodules.articulated_dataset import ArticulatedDataset, split_labels, spread_subset
-from datamodules.geometry import PRISMATIC, invert_se3, screw_motion, transform_points
 from datamodules.manifest import Manifest, ManifestError
 from datamodules.shards import SHARD_ARRAYS, ShardError, read_shard
 

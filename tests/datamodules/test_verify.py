@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from synthetic import write_synthetic_set
 
-from datamodules.geometry import PRISMATIC
+from articulate_ssl.geometry.screw import PRISMATIC
 from datamodules.manifest import Manifest
 from datamodules.shards import read_shard, write_shard
 from datamodules.verify import main, verify_set

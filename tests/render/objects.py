@@ -7,7 +7,7 @@ from math import pi
 import numpy as np
 import trimesh
 
-from datamodules.geometry import PRISMATIC, REVOLUTE
+from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE
 from render.articulated_object import ArticulatedObject, Joint
 
 

@@ -23,8 +23,9 @@ import pytest
 import torch
 from dask.distributed import LocalCluster
 
+from articulate_ssl.geometry.screw import screw_motion
+from articulate_ssl.geometry.se3 import transform_points
 from datamodules import atomic
-from datamodules.geometry import screw_motion, transform_points
 from datamodules.manifest import Manifest, set_folder
 from datamodules.shards import read_shard, write_shard
 from datamodules.verify import verify_set

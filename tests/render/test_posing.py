@@ -10,7 +10,7 @@ from objects import box_chain
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
-from datamodules.geometry import screw_motion
+from articulate_ssl.geometry.screw import screw_motion
 from render.posing import pose_labels, sample_rotation, sample_states
 
 

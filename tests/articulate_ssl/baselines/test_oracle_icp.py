@@ -18,9 +18,9 @@ from articulate_ssl.baselines.oracle_icp import (
     register_part,
 )
 from articulate_ssl.baselines.perfect_oracle import perfect_oracle
+from articulate_ssl.geometry.se3 import se3, transform_points
 from articulate_ssl.metrics import ArticulatedPoseMetrics, calibrate
 from datamodules.articulated_dataset import ArticulatedDataset
-from datamodules.geometry import se3, transform_points
 
 FEW = Options(initial_rotations=12, template_points=96)
 

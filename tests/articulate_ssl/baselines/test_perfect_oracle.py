@@ -3,10 +3,11 @@ import torch
 from synthetic import write_synthetic_set
 
 from articulate_ssl.baselines.perfect_oracle import part_points, perfect_oracle
+from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE
+from articulate_ssl.geometry.se3 import transform_points
 from articulate_ssl.metrics import ArticulatedPoseMetrics, calibrate
 from articulate_ssl.metrics.functional import nearest_index
 from datamodules.articulated_dataset import ArticulatedDataset
-from datamodules.geometry import PRISMATIC, REVOLUTE, transform_points
 
 
 @pytest.mark.parametrize("joint_type", [REVOLUTE, PRISMATIC])

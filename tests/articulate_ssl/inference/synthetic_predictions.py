@@ -4,10 +4,11 @@ import numpy as np
 import torch
 import trimesh
 
+from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE
+from articulate_ssl.geometry.se3 import se3, transform_points
 from articulate_ssl.inference.articulation import part_motion
-from articulate_ssl.inference.point_cloud_io import farthest_point_order
-from articulate_ssl.prediction import Prediction
-from datamodules.geometry import PRISMATIC, REVOLUTE, se3, transform_points
+from articulate_ssl.inference.prediction import Prediction
+from articulate_ssl.ops.farthest_point import farthest_point_order
 
 
 def random_rotation(seed: int) -> torch.Tensor:

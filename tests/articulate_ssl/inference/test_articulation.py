@@ -4,7 +4,7 @@ import synthetic_predictions as synthetic
 import torch
 
 from articulate_ssl.inference.articulation import articulate, canonical_object, part_motion, posed_parts, to_input_frame
-from articulate_ssl.prediction import Prediction
+from articulate_ssl.inference.prediction import Prediction
 
 OBJECTS = [synthetic.laptop, synthetic.drawer, synthetic.arm]
 

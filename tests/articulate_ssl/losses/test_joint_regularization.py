@@ -2,8 +2,9 @@
 
 import torch
 
+from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE, screw_motion
+from articulate_ssl.geometry.se3 import transform_points
 from articulate_ssl.losses.joint_regularization import joint_line_points, joint_regularization
-from datamodules.geometry import PRISMATIC, REVOLUTE, screw_motion, transform_points
 
 EDGE = torch.linspace(-0.5, 0.5, 101, dtype=torch.float64)
 

@@ -8,16 +8,10 @@ import roma
 import torch
 from torch import Tensor
 
-from articulate_ssl.prediction import Prediction
-from datamodules.geometry import (
-    PRISMATIC,
-    REVOLUTE,
-    forward_kinematics,
-    invert_se3,
-    screw_motion,
-    se3,
-    transform_points,
-)
+from articulate_ssl.geometry.kinematic_chain import forward_kinematics
+from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE, screw_motion
+from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
+from articulate_ssl.inference.prediction import Prediction
 
 CHAIN, STAR = "chain", "star"
 DOUBLE = torch.float64

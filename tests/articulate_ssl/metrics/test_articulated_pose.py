@@ -8,10 +8,10 @@ import torch.multiprocessing as mp
 from articulated_world import CHAIN, PRISMATIC, REVOLUTE, STAR, articulated_labels, disguise, part_turn
 
 from articulate_ssl.baselines.perfect_oracle import perfect_oracle
+from articulate_ssl.geometry.se3 import se3
+from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.metrics import ArticulatedPoseMetrics, calibrate
 from articulate_ssl.metrics.articulated_pose import PER_CLOUD, PER_JOINT, PER_PART
-from articulate_ssl.prediction import Prediction
-from datamodules.geometry import se3
 
 PRIMARY_ERRORS = ("r_err_deg", "t_err", "flip_rate", "axis_err_deg", "pivot_err", "state_err", "chamfer_l1")
 

@@ -8,6 +8,7 @@ import torch
 from articulated_world import CHAIN, STAR, articulated_labels, disguise, part_turn
 
 from articulate_ssl.baselines.perfect_oracle import perfect_oracle
+from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE
 from articulate_ssl.metrics.calibration import (
     Calibration,
     calibrate,
@@ -17,7 +18,6 @@ from articulate_ssl.metrics.calibration import (
     ransac,
 )
 from articulate_ssl.metrics.functional import rotation_error
-from datamodules.geometry import PRISMATIC, REVOLUTE
 
 
 @pytest.mark.parametrize("num_parts", [1, 2, 3, 4])

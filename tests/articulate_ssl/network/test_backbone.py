@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from articulate_ssl.directions import icosahedron_directions
-from articulate_ssl.equivariance import TOLERANCE, Permutation, Vector, assert_equivariant, off_group_residual
-from articulate_ssl.groups import rotation_group
+from articulate_ssl.geometry.directions import icosahedron_directions
+from articulate_ssl.geometry.equivariance import TOLERANCE, Permutation, Vector, assert_equivariant, off_group_residual
+from articulate_ssl.geometry.kernel_points import symmetric_kernel_points
+from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.network.backbone import DirectionConvolutionBlock, EquivariantBackbone, GroupConvolutionBlock
 from articulate_ssl.ops.direction_convolution import direction_convolution
-from articulate_ssl.ops.kernel_points import symmetric_kernel_points
 from articulate_ssl.ops.neighborhood import build_neighborhood
 
 

@@ -4,8 +4,10 @@ import pytest
 import roma
 import torch
 
-from articulate_ssl.equivariance import TOLERANCE, Permutation, assert_part_equivariant
-from articulate_ssl.groups import rotation_group
+from articulate_ssl.geometry.equivariance import TOLERANCE, Permutation, assert_part_equivariant
+from articulate_ssl.geometry.kernel_points import symmetric_kernel_points
+from articulate_ssl.geometry.rotation_group import rotation_group
+from articulate_ssl.geometry.se3 import se3, transform_points
 from articulate_ssl.network.backbone import EquivariantBackbone
 from articulate_ssl.network.pose_aware_convolution import (
     canonicalize,
@@ -15,9 +17,7 @@ from articulate_ssl.network.pose_aware_convolution import (
 )
 from articulate_ssl.ops import reference
 from articulate_ssl.ops.group_convolution import group_convolution
-from articulate_ssl.ops.kernel_points import symmetric_kernel_points
 from articulate_ssl.ops.neighborhood import build_neighborhood
-from datamodules.geometry import se3, transform_points
 
 
 def _articulated_cloud(rotation, num_points=48):

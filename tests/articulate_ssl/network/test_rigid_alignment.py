@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from articulate_ssl.groups import rotation_group
-from articulate_ssl.network.backbone import EquivariantBackbone
+from articulate_ssl.geometry.rotation_group import rotation_group
+from articulate_ssl.network.options import NetworkOptions
 from articulate_ssl.network.rigid_alignment import RigidAlignment
 
 
@@ -13,8 +13,17 @@ from articulate_ssl.network.rigid_alignment import RigidAlignment
 def test_hypotheses_are_equivariant(order, directions, dtype, tolerance):
     torch.manual_seed(0)
     group = rotation_group(order)
-    backbone = EquivariantBackbone(order, (4, 8), (0.3, 0.5), 10, 13, (24, 16), directions=directions)
-    network = RigidAlignment(backbone, group, 8, 6, 10, directions=directions)
+    sizes = NetworkOptions(
+        group_order=order,
+        dims=[4, 8],
+        radii=[0.3, 0.5],
+        num_neighbors=10,
+        num_kernel_points=13,
+        num_centers=[24, 16],
+        head_dim=6,
+        directions=directions,
+    )
+    network = RigidAlignment(sizes, 10)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.4)
     network.to(dtype)

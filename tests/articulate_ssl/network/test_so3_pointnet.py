@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from articulate_ssl.directions import icosahedron_directions
-from articulate_ssl.equivariance import Permutation, Vector, assert_equivariant
-from articulate_ssl.groups import rotation_group
+from articulate_ssl.geometry.directions import icosahedron_directions
+from articulate_ssl.geometry.equivariance import Permutation, Vector, assert_equivariant
+from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.network.so3_pointnet import DirectionPointNet, SO3PointNet, largest_product
 
 

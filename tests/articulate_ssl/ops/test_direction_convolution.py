@@ -4,9 +4,10 @@ import pytest
 import torch
 from twins import TOLERANCE, assert_same_as_twin, relative_error
 
-from articulate_ssl.directions import icosahedron_directions, kernel_orbits, kernel_rings
-from articulate_ssl.equivariance import Permutation, Vector, assert_equivariant
-from articulate_ssl.groups import rotation_group
+from articulate_ssl.geometry.directions import icosahedron_directions, kernel_orbits, kernel_rings
+from articulate_ssl.geometry.equivariance import Permutation, Vector, assert_equivariant
+from articulate_ssl.geometry.kernel_points import symmetric_kernel_points
+from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.ops import reference
 from articulate_ssl.ops.direction_convolution import (
     _CHANNELS,
@@ -14,7 +15,6 @@ from articulate_ssl.ops.direction_convolution import (
     constant_direction_convolution,
     direction_convolution,
 )
-from articulate_ssl.ops.kernel_points import symmetric_kernel_points
 from articulate_ssl.ops.neighborhood import build_neighborhood
 
 GROUP = rotation_group(60)

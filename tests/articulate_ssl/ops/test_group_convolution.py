@@ -4,11 +4,11 @@ import pytest
 import torch
 from twins import TOLERANCE, assert_same_as_twin, relative_error
 
-from articulate_ssl.equivariance import Permutation, Vector, assert_equivariant
-from articulate_ssl.groups import rotation_group
+from articulate_ssl.geometry.equivariance import Permutation, Vector, assert_equivariant
+from articulate_ssl.geometry.kernel_points import symmetric_kernel_points
+from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.ops import reference
 from articulate_ssl.ops.group_convolution import _TILE_ELEMENTS, group_convolution
-from articulate_ssl.ops.kernel_points import symmetric_kernel_points
 from articulate_ssl.ops.neighborhood import build_neighborhood
 
 

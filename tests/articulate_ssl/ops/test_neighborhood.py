@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from articulate_ssl.groups import rotation_group
-from articulate_ssl.ops.kernel_points import symmetric_kernel_points
+from articulate_ssl.geometry.kernel_points import symmetric_kernel_points
+from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.ops.neighborhood import build_neighborhood, correlate, nearest_neighbors
 
 KERNEL = symmetric_kernel_points(rotation_group(60)).points

@@ -8,7 +8,7 @@ from dataset_writers import box
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datamodules.geometry import PRISMATIC, REVOLUTE
+from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE
 from render.sources.link_graph import FIXED, Link, LinkGraph, LinkJoint, merge_links, tree_order
 
 FILE = Path("object.urdf")

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from dataset_writers import CABINET, DOOR, HINGE, KNOB, LAPTOP_BASE, LID, LID_HINGE, box
 
-from datamodules.geometry import PRISMATIC, REVOLUTE
+from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE
 from render.category import load_category
 from render.sources.link_graph import Link, LinkGraph, LinkJoint
 from render.sources.part_matching import joint_groups, require_rules, to_category

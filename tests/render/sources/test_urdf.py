@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from datamodules.geometry import PRISMATIC, REVOLUTE
+from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE
 from render.category import load_category
 from render.sources import open_source
 from render.sources.urdf import Z_UP_TO_Y_UP, read_urdf

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from manifold3d import Manifold, Mesh64
 
-from datamodules.geometry import REVOLUTE
+from articulate_ssl.geometry.screw import REVOLUTE
 from render.articulated_object import ArticulatedObject
 from render.category import category_names, load_category
 from render.sources import open_source

@@ -1,0 +1,1 @@
+"""`make bench`: speed and memory of the operators, of the backbones and of the whole network."""

@@ -1,0 +1,204 @@
+"""Fit a shape with joints to clouds of objects whose proportions differ, by gradient descent.
+
+Registration moves one rigid shape per part. Ovens differ more in width and height than an open door differs from a
+closed one, so there every cloud's object also stretches each part; what parts and joints explain then shows.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import roma
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from articulate_ssl.geometry.se3 import se3
+from articulate_ssl.ops.chamfer import nearest_distance, nearest_squared_distance
+from articulate_ssl.shape.articulated_shape import MIN_POINTS, ArticulatedShape
+from articulate_ssl.shape.joints import Joints
+from articulate_ssl.shape.part_maps import PartMaps
+from articulate_ssl.shape.stretch import hinged, principal_directions, stretch_matrices
+
+# A distance d counts as d / (1 + d / softness): what the template lacks, and clouds turned over, count little.
+_SOFTNESS = 0.05
+# Largest log-stretch: a part is at most 1.4 times as long or as short as the template's. Chosen, not tuned, as is the
+# network's `stretch_bound` of .3.
+_BOUND = 0.35
+_RIDGE = 1e-3  # weight of the squared log-stretch: decides what the clouds leave open
+_RATE = 0.01  # of Adam, at the start
+_LAST_RATE = 0.02  # what is left of it in the last cycle
+_POINTS = 384  # of template and cloud, drawn anew for every step
+_CAP = 0.06  # distances beyond this count as this when points are given to parts
+_SMOOTHING = 16  # template points over which labels are smoothed
+
+
+class InstanceFit:
+    """Labels and joint lines that n clouds share, and of every cloud its pose, joint states and stretch of each part.
+
+    Parts stretch along the principal axes they have in the template: the root about its centre, any other part about
+    the pivot of its joint, which moves with the part it is on (`shape.stretch`).
+
+    Args:
+        shape: Points and labels at joint state zero; states stay within the joints' limits if there are any.
+        base: [n, 4, 4] start.
+        state: [n, J] start.
+        generator: Of the points drawn.
+    """
+
+    def __init__(self, shape: ArticulatedShape, base: Tensor, state: Tensor, generator: torch.Generator) -> None:
+        self._shape, self._base, self._generator = shape, base, generator
+        self._axis, self._pivot, self._state = shape.joints.axis.clone(), shape.joints.pivot.clone(), state.clone()
+        self._turn, self._shift = (base.new_zeros(len(base), 3) for _ in range(2))
+        self._stretch = base.new_zeros(len(base), shape.num_parts, 3)
+        self._axes = torch.eye(3).to(base).repeat(shape.num_parts, 1, 1)
+        self._center = shape.points.mean(dim=0)
+        self._measure_parts()
+
+    @property
+    def shape(self) -> ArticulatedShape:
+        """Points, labels and joint lines as they are now."""
+        return replace(self._shape, joints=self._joints())
+
+    @property
+    def base(self) -> Tensor:
+        """[n, 4, 4] canonical object space -> cloud."""
+        turn = self._base[:, :3, :3] @ roma.rotvec_to_rotmat(self._turn)
+        return se3(turn, self._base[:, :3, 3] + self._shift)
+
+    @property
+    def state(self) -> Tensor:
+        """[n, J] joint states."""
+        return self._state
+
+    @property
+    def log_stretch(self) -> Tensor:
+        """[n, K, 3] of every part along its principal axes, within the bound."""
+        return _BOUND * (self._stretch / _BOUND).tanh()
+
+    def rehinged(
+        self,
+        joint: int,
+        pivot: Tensor,  # [3]
+    ) -> InstanceFit:
+        """A copy in which a revolute joint's line goes through another point, and states follow as well as they can."""
+        shape, base, state = self.shape, self.base, self.state
+        pivots = shape.joints.pivot.clone()
+        pivots[joint] = pivot
+        moved = replace(shape, joints=replace(shape.joints, pivot=pivots))
+        state = moved.read_states(shape.joints.part_pose(base, state))
+        other = InstanceFit(moved, base, state, self._generator)
+        other._stretch = self._stretch.clone()
+        return other
+
+    def optimise(
+        self,
+        clouds: Tensor,  # [n, N, 3]
+        cycles: int,
+        steps: int = 6,
+        shared: bool = True,
+        keep: float = 1.0,
+    ) -> None:
+        """Descend for `cycles` times `steps` steps; with `shared`, also joint lines, and labels after every cycle.
+
+        Args:
+            keep: Share of the clouds, best fitted first, that count.
+        """
+        own = [self._state, self._turn, self._shift, self._stretch]
+        parameters = [self._axis, self._pivot, *own] if shared else own
+        optimizer = torch.optim.Adam([p.requires_grad_() for p in parameters], lr=_RATE)
+        for cycle in range(cycles):
+            for group in optimizer.param_groups:
+                group["lr"] = _RATE * (0.5 + _LAST_RATE + 0.5 * math.cos(math.pi * cycle / cycles))
+            for _ in range(steps):
+                optimizer.zero_grad()
+                with torch.enable_grad():
+                    self._loss(clouds, keep).backward()
+                optimizer.step()
+                self._state.data = self._shape.joints.clamped(self._state.data)
+            if shared:
+                self._relabel(clouds, keep)
+        for parameter in parameters:
+            parameter.requires_grad_(False)
+
+    @torch.no_grad()
+    def error(
+        self,
+        clouds: Tensor,  # [n, N, 3]
+        queries: int = 512,
+        softened: bool = True,
+    ) -> Tensor:  # [n]
+        """Distance in both directions, `queries` points of either against all points of the other.
+
+        Points spaced s apart lie about s / 2 from those of another sample of the same surface. With all of them as
+        targets that is little next to what a part in the wrong place costs.
+        """
+        posed = self.posed()
+        rows = torch.linspace(0, posed.shape[1] - 1, min(queries, posed.shape[1])).long()
+        forward, backward = nearest_distance(clouds[:, :queries], posed), nearest_distance(posed[:, rows], clouds)
+        return sum(_softened(d).mean(dim=1) if softened else d.mean(dim=1) for d in (forward, backward))
+
+    def posed(self, rows: Tensor | slice = slice(None)) -> Tensor:
+        """[n, T, 3] the template's points in every cloud."""
+        return self.maps().move(self._shape.points[rows], self._shape.label[rows])
+
+    def maps(self) -> PartMaps:
+        """Of every part, from the template to each cloud: stretched, then articulated and posed."""
+        stretch = stretch_matrices(self._axes, self.log_stretch)
+        rest, pivots = hinged(stretch, self._center, self._joints())
+        return rest.then(replace(self._joints(), pivot=pivots).part_pose(self.base, self._state))
+
+    def _joints(self) -> Joints:
+        axis = functional.normalize(self._axis, dim=-1)
+        return replace(self._shape.joints, axis=axis, pivot=self._pivot)
+
+    def _loss(self, clouds: Tensor, keep: float) -> Tensor:
+        rows = self._draw(len(self._shape.label), clouds.device)
+        posed, seen = self.posed(rows), clouds[:, self._draw(clouds.shape[1], clouds.device)]
+        error = _softened(_distance(posed, seen)).mean(dim=1) + _softened(_distance(seen, posed)).mean(dim=1)
+        counts = error.detach() <= error.detach().quantile(keep)
+        return error[counts].sum() + _RIDGE * self._stretch.square().sum()
+
+    def _draw(self, total: int, device: torch.device) -> Tensor:
+        return torch.randperm(total, generator=self._generator)[:_POINTS].to(device)
+
+    def _measure_parts(self) -> None:
+        """Centre of the root, and principal axes of every part; a part that lost its points keeps what it had."""
+        for part in range(self._shape.num_parts):
+            points = self._shape.part(part)
+            if len(points) < MIN_POINTS:
+                continue
+            self._axes[part] = principal_directions(points)
+            if part == self._shape.joints.chain.root:
+                self._center = points.mean(dim=0)
+
+    @torch.no_grad()
+    def _relabel(self, clouds: Tensor, keep: float) -> None:
+        """Give every template point to the part whose motion brings it closest to the clouds."""
+        error = self.error(clouds, queries=256)
+        kept = error <= error.quantile(keep)
+        maps, points, cost = self.maps(), self._shape.points, []
+        for part in range(self._shape.num_parts):
+            moved = torch.einsum("nij,mj->nmi", maps.linear[kept, part], points) + maps.shift[kept, part, None]
+            cost.append(nearest_distance(moved, clouds[kept]).clamp(max=_CAP).sum(dim=0))
+        self._shape = replace(self._shape, label=smooth_labels(points, torch.stack(cost, dim=1)))
+        self._measure_parts()
+
+
+def smooth_labels(
+    points: Tensor,  # [T, 3]
+    cost: Tensor,  # [T, K]
+) -> Tensor:  # [T]
+    """The cheapest part of every point and its neighbours together."""
+    near = torch.cdist(points, points).topk(min(_SMOOTHING, len(points)), largest=False).indices
+    return cost[near].mean(dim=1).argmin(dim=-1)
+
+
+def _distance(query: Tensor, target: Tensor) -> Tensor:
+    """Of every query point to its nearest target point."""
+    return (nearest_squared_distance(query, target) + 1e-12).sqrt()
+
+
+def _softened(distance: Tensor) -> Tensor:
+    return distance / (1 + distance / _SOFTNESS)

@@ -1,0 +1,70 @@
+"""A category's articulated shape, registered to clouds: what part discovery finds and hands over."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from articulate_ssl.discovery.instance_fit import InstanceFit
+from articulate_ssl.geometry.orientation_range import mean_rotation
+from articulate_ssl.geometry.se3 import invert_se3, se3
+from articulate_ssl.shape.articulated_shape import ArticulatedShape
+
+# Joint limits: where nine tenths of the clouds' states lie, and a margin for what few clouds show.
+_LIMIT_QUANTILES = (0.05, 0.95)
+_LIMIT_MARGIN = 0.15  # of the width between them, on either side
+
+
+@dataclass(frozen=True)
+class RegisteredShape:
+    """A shape and, for n clouds, where and how it is in each.
+
+    Canonical object space has the template's principal axes as coordinate axes, so that the half-turns under which an
+    object nearly maps to itself are elements of the rotation group; where orientations are limited, it is turned as the
+    clouds are in the mean. State zero of every joint is near the clouds' mean.
+
+    Attributes:
+        shape: Points, labels and joints.
+        base: [n, 4, 4] canonical object space -> cloud.
+        state: [n, J] joint states.
+        log_stretch: [n, K, 3] of every part along its principal axes (`shape.stretch`).
+        error: [n] distance of every cloud to its reconstruction, stretched to its proportions (`InstanceFit.error`).
+    """
+
+    shape: ArticulatedShape
+    base: Tensor
+    state: Tensor
+    log_stretch: Tensor
+    error: Tensor
+
+    @staticmethod
+    def of(fit: InstanceFit, clouds: Tensor) -> RegisteredShape:
+        """What an instance fit says about its clouds [n, N, 3]."""
+        return RegisteredShape(fit.shape, fit.base, fit.state, fit.log_stretch, fit.error(clouds, softened=False))
+
+    def part_pose(self) -> Tensor:
+        """[n, K, 4, 4] canonical object space -> cloud."""
+        return self.shape.joints.part_pose(self.base, self.state)
+
+    def limits(self) -> Tensor:
+        """[J, 2] between which joint states lie, as far as the clouds show."""
+        limits = torch.quantile(self.state, torch.tensor(_LIMIT_QUANTILES).to(self.state), dim=0)
+        margin = _LIMIT_MARGIN * (limits[1] - limits[0])
+        return torch.stack([limits[0] - margin, limits[1] + margin], dim=-1)
+
+    def limited(self) -> ArticulatedShape:
+        """The shape with these limits."""
+        return replace(self.shape, joints=replace(self.shape.joints, limits=self.limits()))
+
+    def turned_to_mean(self) -> RegisteredShape:
+        """The same with the canonical space turned as the clouds are in the mean."""
+        turn = mean_rotation(self.base[:, :3, :3])
+        turn = se3(turn, turn.new_zeros(3))
+        return replace(self, shape=self.shape.in_frame(turn), base=self.base @ invert_se3(turn))
+
+
+def trimmed_mean(error: Tensor, count: int) -> float:
+    """Mean of the `count` smallest errors: some clouds are aligned wrongly."""
+    return float(error.sort().values[:count].mean())

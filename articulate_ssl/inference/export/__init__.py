@@ -1,0 +1,4 @@
+"""What a prediction leaves on disk: one file for each thing that is written, each with `write(result)`.
+
+To write something else, add a file with `write(result: ScanResult) -> list[Path]` and name it in `folder.EXPORTERS`.
+"""

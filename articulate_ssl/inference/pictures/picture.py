@@ -1,0 +1,215 @@
+"""Pictures of a prediction, drawn with matplotlib alone: no display, no OpenGL."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patheffects import Normal, Stroke
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from articulate_ssl.geometry.screw import PRISMATIC
+from articulate_ssl.inference.articulation import articulate, canonical_object, posed_parts, to_canonical
+from articulate_ssl.inference.pictures.part_colour import part_colour
+from articulate_ssl.inference.pictures.viewpoint import viewing_rotation
+from articulate_ssl.inference.prediction import Prediction
+from datamodules.atomic import atomic_write
+
+PANEL_INCHES = 2.6
+INK = "#222222"
+LIGHT = np.array([-0.36, 0.6, 0.71])
+
+
+@dataclass(frozen=True)
+class SampleRow:
+    """One row of `draw_test_samples`.
+
+    Attributes:
+        title: What the sample is and how well it went, such as "median: R 3.1 deg".
+        points: [N, 3] the input, camera space.
+        prediction: Its prediction, B = 1, on the same points.
+        true_part: [N] ground-truth parts, numbered as the prediction numbers them, or None.
+    """
+
+    title: str
+    points: np.ndarray
+    prediction: Prediction
+    true_part: np.ndarray | None = None
+
+
+def draw_prediction(
+    prediction: Prediction,  # B = 1
+    points: np.ndarray,  # [N, 3] the cloud, camera space
+    part_id: np.ndarray,  # [N] predicted part of every point
+    state_range: Tensor,  # [J, 2] lowest and highest joint state
+    path: str | os.PathLike,
+) -> None:
+    """Write the picture of `prediction_figure` as PNG, whole or not at all."""
+    _save(prediction_figure(prediction, points, part_id, state_range), path)
+
+
+def draw_test_samples(rows: Sequence[SampleRow], path: str | os.PathLike) -> None:
+    """Write the picture of `samples_figure` as PNG, whole or not at all."""
+    _save(samples_figure(rows), path)
+
+
+def prediction_figure(
+    prediction: Prediction,  # B = 1
+    points: np.ndarray,  # [N, 3]
+    part_id: np.ndarray,  # [N]
+    state_range: Tensor,  # [J, 2]
+) -> Figure:
+    """Six panels: input by part, reconstruction, canonical object with its joints, and three articulation states.
+
+    The states are the ends and the middle of `state_range`, as in the paper's manipulation figure; an object without
+    joints has the first three panels only. The predicted base pose is undone, and all panels share one view and scale.
+    """
+    prediction = prediction.to("cpu")
+    state_range = state_range.to(prediction.joint_state)
+    parts = np.repeat(np.arange(prediction.num_parts), prediction.part_shape.shape[2])
+    panels = [
+        ("Input, by predicted part", torch.as_tensor(points), part_id),
+        ("Reconstruction", posed_parts(prediction)[0], parts),
+        ("Canonical object and joints", articulate(prediction, torch.zeros_like(prediction.joint_state))[0], parts),
+    ]
+    for share in (0.0, 0.5, 1.0) if len(state_range) else ():
+        states = torch.lerp(state_range[:, 0], state_range[:, 1], share)
+        panels.append((f"Articulated to {_state_text(prediction, states)}", articulate(prediction, states)[0], parts))
+
+    view = viewing_rotation(prediction, state_range)
+    arrows = [_joint_arrow(prediction, j) @ view.T for j in range(len(state_range))]
+    shapes = [_seen(prediction, cloud, view) for _, cloud, _ in panels]
+    window = _window([*shapes, *arrows])
+    figure, axes = _grid([window], len(panels))
+    for ax, (title, _, ids), shape in zip(axes[0], panels, shapes, strict=True):
+        _draw_cloud(ax, shape, ids, window)
+        ax.set_title(title, fontsize=9, color=INK)
+    for arrow in arrows:
+        _draw_arrow(axes[0, 2], arrow)
+    return figure
+
+
+def samples_figure(rows: Sequence[SampleRow]) -> Figure:
+    """A row per sample: input by ground-truth part (grey if unknown), by predicted part, and the reconstruction."""
+    shapes, windows = [], []
+    for row in rows:
+        prediction = row.prediction.to("cpu")
+        view = viewing_rotation(prediction, prediction.joint_state[0, :, None].expand(-1, 2))
+        points = _seen(prediction, torch.as_tensor(row.points), view)
+        shapes.append((points, points, _seen(prediction, posed_parts(prediction)[0], view)))
+        windows.append(_window(shapes[-1]))
+
+    figure, axes = _grid(windows, 3)
+    for row, row_axes, row_shapes, window in zip(rows, axes, shapes, windows, strict=True):
+        truth = np.full(len(row.points), -1) if row.true_part is None else row.true_part
+        predicted = row.prediction.part_id[0].cpu().numpy()
+        parts = np.repeat(np.arange(row.prediction.num_parts), row.prediction.part_shape.shape[2])
+        for ax, shape, ids in zip(row_axes, row_shapes, (truth, predicted, parts), strict=True):
+            _draw_cloud(ax, shape, ids, window)
+        row_axes[0].set_title(row.title, fontsize=9, color=INK, loc="left", fontweight="bold")
+    heading = "Input" if all(r.true_part is None for r in rows) else "Input, by true part"
+    for ax, text in zip(axes[-1], (heading, "By predicted part", "Reconstruction"), strict=True):
+        ax.text(0.5, -0.02, text, transform=ax.transAxes, ha="center", va="top", fontsize=9, color=INK)
+    return figure
+
+
+def _window(shapes: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Centre [2] and half size [2] of the rectangle that holds all projected shapes."""
+    flat = np.concatenate(shapes)[:, :2]
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    half = 0.53 * (high - low)
+    return (low + high) / 2, np.maximum(half, max(0.4 * half.max(), 1e-9))
+
+
+def _grid(windows: Sequence[tuple[np.ndarray, np.ndarray]], columns: int) -> tuple[Figure, np.ndarray]:
+    """A figure with one row of panels per window, as high as its window asks for."""
+    heights = [PANEL_INCHES * half[1] / half[0] for _, half in windows]
+    size = (columns * (PANEL_INCHES + 0.1), sum(heights) + 0.4 * len(heights))
+    figure = Figure(figsize=size, dpi=150, layout="constrained")
+    return figure, figure.subplots(len(windows), columns, squeeze=False, height_ratios=heights)
+
+
+def _draw_cloud(
+    ax: Axes,
+    shape: np.ndarray,  # [N, 3] right, up, towards the viewer
+    part_id: np.ndarray,  # [N], -1 is grey
+    window: tuple[np.ndarray, np.ndarray],
+) -> None:
+    """Points as lit discs that just close up, far ones first and paler."""
+    brightness, spacing = np.ones(len(shape)), np.zeros(len(shape))
+    for part in np.unique(part_id):
+        of_part = part_id == part
+        brightness[of_part], spacing[of_part] = _lambert(shape[of_part])
+    depth = (shape[:, 2] - shape[:, 2].min()) / max(np.ptp(shape[:, 2]), 1e-12)
+    colour = np.where(part_id[:, None] < 0, 150, part_colour(part_id)) / 255 * brightness[:, None]
+    colour = 1 - (0.7 + 0.3 * depth[:, None]) * (1 - colour)
+    center, half = window
+    diameter = np.clip(2.0 * spacing * PANEL_INCHES * 72 / (2 * half[0]), 1.2, 9.0)
+    order = np.argsort(shape[:, 2])
+    ax.scatter(
+        *shape[order, :2].T, s=diameter[order] ** 2, c=colour[order], linewidths=0.2, edgecolors=0.7 * colour[order]
+    )
+    ax.set_xlim(center[0] - half[0], center[0] + half[0])
+    ax.set_ylim(center[1] - half[1], center[1] + half[1])
+    ax.set_aspect("equal")
+    ax.axis("off")
+
+
+def _lambert(
+    shape: np.ndarray,  # [N, 3] one part
+) -> tuple[np.ndarray, float]:
+    """Brightness [N] of the points' local planes in light from the upper left, both sides alike; and point spacing."""
+    distance, index = cKDTree(shape).query(shape, k=range(1, min(16, len(shape)) + 1))
+    spread = shape[index] - shape[index].mean(axis=1, keepdims=True)
+    normal = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))[1][:, :, 0]
+    normal = np.where(normal[:, 2:] < 0, -normal, normal)
+    return 0.68 + 0.32 * np.clip(normal @ LIGHT, 0, 1), float(np.median(distance[:, -1]) / np.sqrt(len(index[0])))
+
+
+def _draw_arrow(ax: Axes, arrow: np.ndarray) -> None:
+    style = dict(arrowstyle="-|>,head_width=0.25,head_length=0.5", color=INK, linewidth=1.6, shrinkA=0, shrinkB=0)
+    halo = [Stroke(linewidth=3.6, foreground="white"), Normal()]
+    ax.annotate("", xy=arrow[2, :2], xytext=arrow[0, :2], arrowprops=style | {"path_effects": halo}, zorder=3)
+    ax.plot(*arrow[1, :2], "o", color="white", markeredgecolor=INK, markersize=4.5, zorder=4)
+
+
+def _joint_arrow(
+    prediction: Prediction,
+    joint: int,
+) -> np.ndarray:  # [3, 3] tail, pivot, tip, in canonical object space
+    """The joint line where it passes the part that it moves, a little longer than that part."""
+    axis = prediction.canonical_axis[0, joint].double().numpy()
+    pivot = prediction.canonical_pivot[0, joint].double().numpy()
+    part = canonical_object(prediction)[0, prediction.joint_child[0, joint]].double().numpy()
+    along = (part - pivot) @ axis
+    middle = (part.min(axis=0) + part.max(axis=0)) / 2
+    anchor = middle if prediction.joint_type[0, joint] == PRISMATIC else pivot + axis * (along.min() + along.max()) / 2
+    reach = 0.6 * max(np.ptp(along), 0.6 * np.ptp(part, axis=0).max())
+    return np.stack([anchor - axis * reach, anchor, anchor + axis * reach])
+
+
+def _state_text(prediction: Prediction, states: Tensor) -> str:
+    texts = [
+        f"{state:.2g}" if kind == PRISMATIC else f"{np.degrees(state):.0f}°"
+        for state, kind in zip(states.tolist(), prediction.joint_type[0].tolist(), strict=True)
+    ]
+    return ", ".join(texts if len(set(texts)) > 1 else texts[:1]).replace("-", "\N{MINUS SIGN}")
+
+
+def _seen(
+    prediction: Prediction,
+    cloud: Tensor,  # [..., 3] camera space
+    view: np.ndarray,  # [3, 3]
+) -> np.ndarray:  # [N, 3] right, up, towards the viewer
+    return to_canonical(prediction, cloud).reshape(-1, 3).numpy() @ view.T
+
+
+def _save(figure: Figure, path: str | os.PathLike) -> None:
+    with atomic_write(path) as file:
+        figure.savefig(file, format="png", facecolor="white")

@@ -1,0 +1,93 @@
+"""The category's canonical object: what its instances have in common, as parameters that heads add to."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from articulate_ssl.geometry.kinematic_chain import KinematicChain, extract_chain, pair_index
+from articulate_ssl.ops.farthest_point import farthest_point_order
+from articulate_ssl.shape.articulated_shape import ArticulatedShape
+from articulate_ssl.shape.joints import pair_of_joints
+from articulate_ssl.shape.stretch import principal_directions
+
+_START_SIZE = 0.2  # standard deviation of a part's points before anything is learnt; objects have diagonal 1
+# Adjacency confidence of a joint that discovery found, beside 0 of all other pairs: seven to one in a spanning tree.
+_FOUND = 2.0
+
+
+class CanonicalObject(NamedTuple):
+    """The category's shapes and joint lines, with gradient, in canonical object space."""
+
+    shape: Tensor  # [K, M, 3]
+    axis: Tensor  # [E, 3] unit, of all part pairs
+    pivot: Tensor  # [E, 3]
+
+
+class CategoryObject(nn.Module):
+    """Category-level part shapes, their assembly, joint lines and adjacency.
+
+    Attributes:
+        template: [K, M, 3] canonical part shapes, each about its own origin.
+        assembly: [K, 3] assembling translations.
+        axis: [E, 3] and pivot: [E, 3] joint lines of all part pairs.
+        confidence: [E] adjacency of the part pairs.
+        pairs: [E, 2] the part pairs.
+        principal_axes: [K, 3, 3] columns along which instances stretch a part.
+        mean_confidence: [E] running mean of the predicted adjacency confidences, from which the chain is extracted.
+    """
+
+    def __init__(self, num_parts: int, shape_points: int) -> None:
+        """Args: K and M."""
+        super().__init__()
+        pairs = pair_index(num_parts)
+        self.template = nn.Parameter(_START_SIZE * torch.randn(num_parts, shape_points, 3))
+        self.assembly = nn.Parameter(torch.zeros(num_parts, 3))
+        self.axis = nn.Parameter(functional.normalize(torch.randn(len(pairs), 3), dim=-1))
+        self.pivot = nn.Parameter(torch.zeros(len(pairs), 3))
+        self.confidence = nn.Parameter(torch.zeros(len(pairs)))
+        self.register_buffer("pairs", pairs, persistent=False)
+        self.register_buffer("principal_axes", torch.eye(3).repeat(num_parts, 1, 1))
+        self.register_buffer("mean_confidence", torch.zeros(len(pairs)))
+
+    @property
+    def num_parts(self) -> int:
+        """K."""
+        return self.template.shape[0]
+
+    def canonical(self) -> CanonicalObject:
+        """Shapes and joint lines in canonical object space."""
+        shape = self.template + self.assembly[:, None]
+        return CanonicalObject(shape, functional.normalize(self.axis, dim=-1), self.pivot)
+
+    def chain(self) -> KinematicChain:
+        """The category's kinematic chain, from the running mean of the predicted adjacency confidences."""
+        return extract_chain(self.mean_confidence, self.num_parts)
+
+    @torch.no_grad()
+    def follow(self, confidence: Tensor, weight: float) -> None:
+        """Draw the running mean to the confidences [B, E] of a batch."""
+        self.mean_confidence.lerp_(confidence.mean(dim=0), weight)
+
+    @torch.no_grad()
+    def adopt(self, shape: ArticulatedShape) -> None:
+        """Take over a discovered shape and its joints."""
+        shape_points = self.template.shape[1]
+        for part in range(self.num_parts):
+            points = shape.part(part).cpu().numpy()
+            order = farthest_point_order(points, min(len(points), shape_points))
+            thinned = torch.as_tensor(np.resize(points[order], (shape_points, 3)))
+            center = thinned.mean(dim=0)
+            self.assembly[part] = center
+            self.template[part] = thinned - center
+            self.principal_axes[part] = principal_directions(thinned)
+        self.confidence.zero_()
+        for j, pair in enumerate(pair_of_joints(shape.joints.chain, self.pairs)):
+            self.axis[pair] = shape.joints.axis[j]
+            self.pivot[pair] = shape.joints.pivot[j]
+            self.confidence[pair] = _FOUND
+        self.mean_confidence.copy_(self.confidence)

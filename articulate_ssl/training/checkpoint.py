@@ -1,0 +1,43 @@
+"""From a checkpoint file to a module that is ready to predict."""
+
+from __future__ import annotations
+
+import os
+
+from articulate_ssl.discovery.options import DiscoveryOptions
+from articulate_ssl.inference.checkpoint_file import CheckpointError, read_checkpoint
+from articulate_ssl.inference.pose_estimation import InferenceOptions
+from articulate_ssl.losses.objective import ObjectiveOptions
+from articulate_ssl.network.options import NetworkOptions
+from articulate_ssl.training.module import ArticulatedPoseModule
+from articulate_ssl.training.schedule import ScheduleOptions
+
+_GROUPS = {
+    "network": NetworkOptions,
+    "objective": ObjectiveOptions,
+    "schedule": ScheduleOptions,
+    "discovery": DiscoveryOptions,
+    "inference": InferenceOptions,
+}
+
+
+def load_module(path: str | os.PathLike) -> ArticulatedPoseModule:
+    """The trained module of a checkpoint, on the CPU, in evaluation mode.
+
+    Raises:
+        CheckpointError: if the file is missing, damaged, foreign, or does not fit this version of the code.
+    """
+    content = read_checkpoint(path)
+    plain = dict(content["hyper_parameters"])
+    try:
+        arguments = {name: _GROUPS[name](**value) if name in _GROUPS else value for name, value in plain.items()}
+        module = ArticulatedPoseModule(**arguments)
+        module.load_state_dict(content["state_dict"])
+    except (TypeError, ValueError, RuntimeError) as error:
+        problem = str(error).splitlines()[0]
+        raise CheckpointError(
+            f"{path}: does not fit this version of articulate-ssl ({problem}); "
+            "train again, or use the version it was made with"
+        ) from error
+    module.on_load_checkpoint(content)
+    return module.eval()

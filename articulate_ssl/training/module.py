@@ -1,0 +1,254 @@
+"""The LightningModule: owns networks and options, trains by a recipe, tests honestly, predicts."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import asdict, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lightning.pytorch import LightningModule
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+from articulate_ssl.discovery.options import DiscoveryOptions
+from articulate_ssl.geometry.orientation_range import OrientationRange
+from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE
+from articulate_ssl.inference.checkpoint_file import CHECKPOINT_KEY
+from articulate_ssl.inference.pose_estimation import InferenceOptions, PoseEstimator
+from articulate_ssl.inference.prediction import Prediction
+from articulate_ssl.losses.objective import ObjectiveOptions, rigid_loss
+from articulate_ssl.network.articulated_network import ArticulatedNetwork
+from articulate_ssl.network.options import NetworkOptions
+from articulate_ssl.network.rigid_alignment import RigidAlignment
+from articulate_ssl.shape.observation import Observation
+from articulate_ssl.training.recipes import recipe_class
+from articulate_ssl.training.recipes.recipe import Outcome
+from articulate_ssl.training.running_statistics import RadiusStatistics, StateRange
+from articulate_ssl.training.schedule import ScheduleOptions
+from articulate_ssl.training.test_report import TestReport
+from datamodules.articulated_dataset import split_labels
+
+JOINT_TYPES = {"revolute": REVOLUTE, "prismatic": PRISMATIC}
+_CONFIDENCE_WEIGHT = 0.02  # of a batch in the running mean of adjacency confidences, once fifty are seen
+
+
+class ArticulatedPoseModule(LightningModule):
+    """Self-supervised category-level articulated object pose estimation.
+
+    Args:
+        category: Category name, kept in checkpoints.
+        num_parts: K.
+        joint_type: `revolute` or `prismatic`.
+        state_range: Width of the category's articulation range: radians, or normalised length.
+        recipe: `staged` (part discovery by registration, then the network) or `paper` (its objective and nothing else).
+        network: Sizes of the networks.
+        objective: Loss weights.
+        schedule: Steps and learning rates.
+        discovery: Effort of part discovery (staged recipe).
+        inference: Refinement at test time.
+        calibration_samples: Training clouds on which `lightning test` relates slots and canonical spaces to labels.
+        orientation_range: How far objects are turned from their mean orientation at most, in degrees; 180 stands for
+            any orientation, less where a camera is held upright.
+
+    Raises:
+        ValueError: for an unknown recipe, joint type or proposal, or if rigid alignment, which is for any orientation,
+            is asked for within a range.
+    """
+
+    def __init__(
+        self,
+        category: str,
+        num_parts: int,
+        joint_type: str = "revolute",
+        state_range: float = math.pi / 2,
+        recipe: str = "staged",
+        network: NetworkOptions = NetworkOptions(),  # noqa: B008 frozen
+        objective: ObjectiveOptions = ObjectiveOptions(),  # noqa: B008
+        schedule: ScheduleOptions = ScheduleOptions(),  # noqa: B008
+        discovery: DiscoveryOptions = DiscoveryOptions(),  # noqa: B008
+        inference: InferenceOptions = InferenceOptions(),  # noqa: B008
+        calibration_samples: int = 128,
+        orientation_range: float = 180.0,
+    ) -> None:
+        super().__init__()
+        options = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
+        observation = Observation(OrientationRange(orientation_range), objective.unidirectional)
+        _check(num_parts, joint_type, observation, schedule)
+        self.save_hyperparameters({name: _plain(value) for name, value in options.items()}, logger=False)
+        self.category, self.num_parts, self.schedule = category, num_parts, schedule
+        self.inference, self.calibration_samples = inference, calibration_samples
+
+        self.articulated = ArticulatedNetwork(network, num_parts, JOINT_TYPES[joint_type], state_bound=state_range)
+        self.rigid = RigidAlignment(network, num_parts * network.shape_points) if schedule.rigid_steps else None
+        # Without pose awareness a second estimation would repeat the first.
+        iterations = network.iterations if network.pose_aware else 1
+        self.estimator = PoseEstimator(
+            self.articulated, self.rigid, iterations, observation, objective.posterior_scale, inference
+        )
+        self.recipe = recipe_class(recipe)(self.estimator, objective, schedule, discovery)
+        self.radius = RadiusStatistics()
+        self.states = StateRange(num_parts - 1)
+        self.num_points = 512  # of a training cloud; a scan is thinned to as many
+
+    @property
+    def orientation(self) -> OrientationRange:
+        """How far objects were turned in the clouds that this was trained on."""
+        return self.estimator.observation.orientation
+
+    @property
+    def state_range(self) -> Tensor:
+        """[J, 2] lowest and highest joint state in training, on average over batches."""
+        return self.states.limits
+
+    # Prediction
+
+    def predict_points(self, points: Tensor, refine: bool | None = None) -> Prediction:
+        """Predictions for normalised clouds [B, N, 3] in farthest-point order: see `PoseEstimator.predict`."""
+        return self.estimator.predict(points, self.num_points, refine)
+
+    def predict_cloud(
+        self,
+        points: np.ndarray,  # [N, 3] any unit and origin
+        refine: bool | None = None,
+    ) -> tuple[Prediction, np.ndarray, float, np.ndarray]:
+        """Predict a scan of unknown scale: see `PoseEstimator.predict_scan`."""
+        radius = float(self.radius.mean), float(self.radius.spread)
+        return self.estimator.predict_scan(points, self.num_points, radius, refine)
+
+    # Training
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        """Adam; the category's shapes and joints are a group of their own."""
+        shared = list(self.articulated.category.parameters())
+        category = set(map(id, shared))
+        others = [p for p in self.parameters() if id(p) not in category]
+        optimizer = torch.optim.Adam(
+            [{"params": others}, {"params": shared}], lr=self.schedule.learning_rate, betas=(0.9, 0.999), eps=1e-8
+        )
+        rates = [self.recipe.network_rate, self.recipe.category_rate]
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, rates)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def setup(self, stage: str) -> None:
+        """Mixed precision, if the trainer asks for it, is for the backbones."""
+        mixed = "mixed" in str(self.trainer.precision)
+        for network in (self.articulated, self.rigid):
+            if network is not None:
+                network.mixed_precision = mixed
+
+    def on_train_start(self) -> None:
+        """Remember how many points a cloud has."""
+        self.num_points = self.trainer.datamodule.hparams.num_points
+
+    def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
+        """One step of stage 0, or of the recipe; under autocast only the backbones run in low precision."""
+        with torch.autocast(self.device.type, enabled=False):
+            points = split_labels(batch)[0]["points"].float()
+            self.radius.follow(points, self.global_step)
+            if self.global_step < self.schedule.rigid_steps:
+                loss = rigid_loss(self.rigid(points), points, self.estimator.observation.bidirectional)
+                self.log("loss", loss.detach(), prog_bar=True)
+                return loss
+            self.recipe.prepare(self._training_clouds, self.num_points)
+            outcome = self.recipe.step(points, self.global_step, self._step_generator)
+            self._track(outcome)
+            return outcome.loss
+
+    def _step_generator(self) -> torch.Generator:
+        """Of what is random in this step on this rank."""
+        return torch.Generator().manual_seed(self.global_step * self.trainer.world_size + self.global_rank)
+
+    def _training_clouds(self, count: int) -> Tensor:
+        """A fixed subset of the training clouds [n, N, 3] with all their points."""
+        batches = [split_labels(b)[0] for b in self.trainer.datamodule.discovery_dataloader(count)]
+        return torch.cat([b["dense_points"] for b in batches]).float()
+
+    @torch.no_grad()
+    def _track(self, outcome: Outcome) -> None:
+        """Log the terms and the warning signs (design 3.5); follow confidences and joint states."""
+        terms, selected = outcome.terms, outcome.selected
+        weight = max(_CONFIDENCE_WEIGHT, 1 / (self.global_step + 1))
+        self.articulated.category.follow(selected.structure.confidence, weight)
+        state = selected.state[:, 0]
+        self.states.follow(state)
+        occupancy = one_hot(terms.association.argmax(dim=-1), self.num_parts).float().mean(dim=(0, 1))
+        spread = state.std(dim=0).mean() if len(state) > 1 else state.new_zeros(())
+        self.log_dict(
+            {
+                "loss": terms.loss,
+                "rec": terms.reconstruction,
+                "reg": terms.joints,
+                "distill": terms.distillation,
+                "deviation": terms.deviation,
+                "seg": terms.segmentation,
+                "state_spread": spread.rad2deg() if self.articulated.joint_type == REVOLUTE else spread,
+                "smallest_part": occupancy.min(),
+            },
+            prog_bar=True,
+        )
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Mark the checkpoint as ours, and keep what the recipe needs to resume."""
+        checkpoint[CHECKPOINT_KEY] = {"version": 2, "num_points": self.num_points, "recipe": self.recipe.kept()}
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Take it back."""
+        own = checkpoint[CHECKPOINT_KEY]
+        self.num_points = own["num_points"]
+        self.recipe.restore(own["recipe"])
+
+    # Validation and test
+
+    def validation_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
+        """Reconstruction error of held-out rotations of training clouds; no label is read."""
+        points = split_labels(batch)[0]["points"]
+        if self.global_step < self.schedule.rigid_steps or not self.recipe.ready:
+            return
+        error = self.predict_points(points, refine=False).reconstruction_error.mean()
+        self.log("val_reconstruction", error, prog_bar=True, batch_size=len(points), sync_dist=True)
+
+    def on_test_start(self) -> None:
+        """Relate slots and canonical spaces to the labelled ones, on training clouds."""
+        loader = self.trainer.datamodule.calibration_dataloader(self.calibration_samples)
+        batches = [self._whole(self.transfer_batch_to_device(batch, self.device, 0)) for batch in loader]
+        predictions = [self.predict_points(split_labels(batch)[0]["points"]) for batch in batches]
+        self.test_report = TestReport(predictions, batches).to(self.device)
+
+    def test_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
+        """Predict, then compare."""
+        batch = self._whole(batch)
+        start = time.perf_counter()
+        prediction = self.predict_points(split_labels(batch)[0]["points"])
+        self.test_report.update(prediction, batch, time.perf_counter() - start)
+
+    def _whole(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """The batch with as many points as registration reads; the networks still see those that they would."""
+        count = max(batch["points"].shape[1], self.inference.points)
+        return batch | {"points": batch["dense_points"][:, :count]}
+
+    def on_test_end(self) -> None:
+        """Write metrics.json, metrics.csv and the picture of best, median and worst samples."""
+        folder = Path(self.trainer.log_dir or self.trainer.default_root_dir)
+        data = self.trainer.datamodule
+        metrics = self.test_report.metrics.compute()  # on every rank: it gathers
+        if self.trainer.is_global_zero:
+            self.test_report.write(folder, metrics, data.manifest, str(self.trainer.ckpt_path), self.inference.refine)
+
+
+def _plain(value: Any) -> Any:
+    """An option as a checkpoint may hold it."""
+    return asdict(value) if is_dataclass(value) else value
+
+
+def _check(num_parts: int, joint_type: str, observation: Observation, schedule: ScheduleOptions) -> None:
+    """Refuse options that make no sense."""
+    if joint_type not in JOINT_TYPES:
+        raise ValueError(f"joint_type must be one of {sorted(JOINT_TYPES)}, got {joint_type!r}")
+    if num_parts < 2:
+        raise ValueError(f"num_parts must be at least 2, got {num_parts}")
+    if observation.orientation.limited and schedule.rigid_steps:
+        raise ValueError("rigid_steps align clouds of any orientation: leave them 0, or orientation_range 180")

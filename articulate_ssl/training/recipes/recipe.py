@@ -1,0 +1,99 @@
+"""What a recipe is: the loss of a step, how fast what learns, and what it finds out before the networks learn."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from articulate_ssl.discovery.options import DiscoveryOptions
+from articulate_ssl.inference.pose_estimation import PoseEstimator
+from articulate_ssl.losses.objective import ObjectiveOptions, Terms
+from articulate_ssl.network.hypotheses import Hypotheses
+from articulate_ssl.training.schedule import ScheduleOptions
+
+
+class Outcome(NamedTuple):
+    """Of one step.
+
+    Attributes:
+        loss: What is differentiated: the mean over the iterations of pose estimation.
+        terms: Of the last iteration.
+        selected: The hypothesis of each cloud that trained, in the last iteration.
+    """
+
+    loss: Tensor
+    terms: Terms
+    selected: Hypotheses
+
+    @staticmethod
+    def of(iterations: list[tuple[Terms, Hypotheses]]) -> Outcome:
+        """From the terms and selected hypotheses of every iteration."""
+        return Outcome(torch.stack([terms.loss for terms, _ in iterations]).mean(), *iterations[-1])
+
+
+class Recipe(ABC):
+    """Trains the articulated network; stage 0, if there is one, comes before and is the same for all recipes.
+
+    Args:
+        estimator: Whose networks are trained.
+        objective: Weights of the losses.
+        schedule: Steps and learning rates.
+        discovery: Effort of part discovery.
+    """
+
+    def __init__(
+        self,
+        estimator: PoseEstimator,
+        objective: ObjectiveOptions,
+        schedule: ScheduleOptions,
+        discovery: DiscoveryOptions,
+    ) -> None:
+        self.estimator, self.objective = estimator, objective
+        self.schedule, self.discovery = schedule, discovery
+
+    @property
+    def ready(self) -> bool:
+        """Whether the networks have begun to learn, so that it makes sense to validate them."""
+        return True
+
+    def prepare(self, clouds: Callable[[int], Tensor], num_points: int) -> None:
+        """What comes before the first step after stage 0. Called before every step; does something once.
+
+        Args:
+            clouds: Gives so many training clouds [n, N, 3], with all their points; the same on every rank.
+            num_points: Of a cloud in training.
+        """
+        return
+
+    @abstractmethod
+    def step(
+        self,
+        points: Tensor,  # [B, N, 3]
+        step: int,
+        generator: Callable[[], torch.Generator],
+    ) -> Outcome:
+        """The loss of a batch of training clouds.
+
+        Args:
+            generator: Makes one for what is random in this step; ranks differ.
+        """
+
+    @abstractmethod
+    def network_rate(self, step: int) -> float:
+        """Learning rate of the networks relative to the initial one."""
+
+    def category_rate(self, step: int) -> float:
+        """The same for category-level shapes and joints."""
+        return self.network_rate(step)
+
+    def kept(self) -> dict[str, Tensor] | None:
+        """What a checkpoint must keep for training to resume."""
+        return None
+
+    def restore(self, kept: dict[str, Tensor] | None) -> None:
+        """Take it back."""
+        return

@@ -1,0 +1,153 @@
+"""The staged recipe: part discovery by registration, then the network on what that found, then on all clouds.
+
+1. *Discovery* (`discovery.discover`) on some training clouds, before the first step. What it found is handed over
+   whole: shape and joints become the category's, and the clouds that fit best are kept with their registrations.
+2. *Warm-up*: these clouds, turned afresh, with known poses. The category's shapes and joints are held.
+3. *Self-supervision*: any training cloud, by reconstruction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import torch
+from torch import Tensor
+
+from articulate_ssl.discovery.discover import discover
+from articulate_ssl.discovery.proposals import load_proposals
+from articulate_ssl.geometry.rotation_group import rotation_group
+from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
+from articulate_ssl.inference.pose_estimation import Iteration
+from articulate_ssl.losses.objective import PoseTarget, staged_terms
+from articulate_ssl.network.hypotheses import Hypotheses
+from articulate_ssl.training.recipes.recipe import Outcome, Recipe
+
+# Registration that teaches: starts from the winner, so it may begin finer and end sooner than at test time.
+_SCALES, _ROUNDS = (0.04, 0.02), 4
+
+
+@dataclass(frozen=True)
+class HandOver:
+    """What discovery hands over besides the category's shape: n clouds and how the shape is in each.
+
+    Attributes:
+        points: [n, N, 3].
+        base: [n, 4, 4] canonical object space -> cloud.
+        state: [n, J] joint states.
+        log_stretch: [n, K, 3] of every part along its principal axes.
+        limits: [J, 2] between which joint states lie.
+    """
+
+    points: Tensor
+    base: Tensor
+    state: Tensor
+    log_stretch: Tensor
+    limits: Tensor
+
+
+class TrainingRecipe(Recipe):
+    """See above. The learning rate falls along a cosine."""
+
+    def __init__(self, *args) -> None:
+        super().__init__(*args)
+        load_proposals(self.discovery.proposals)  # a misspelt name is to be told before anything runs
+        self.found: HandOver | None = None
+        self.group = rotation_group(len(self.estimator.articulated.pose_head.elements))
+
+    @property
+    def ready(self) -> bool:
+        """After discovery."""
+        return self.found is not None
+
+    def prepare(self, clouds: Callable[[int], Tensor], num_points: int) -> None:
+        """Part discovery, once."""
+        if self.found is not None:
+            return
+        dense, network = clouds(self.discovery.clouds), self.estimator.articulated
+        with torch.random.fork_rng(devices=[]), torch.no_grad():
+            found = discover(dense, network.num_parts, network.joint_type, self.discovery, self.estimator.observation)
+        kept = found.error.argsort()[: self.discovery.kept(len(dense))]
+        self.found = HandOver(
+            dense[kept, :num_points], found.base[kept], found.state[kept], found.log_stretch[kept], found.limits()
+        )
+        network.category.adopt(found.shape)
+
+    def step(self, points: Tensor, step: int, generator: Callable[[], torch.Generator]) -> Outcome:
+        """Warm-up or self-supervision."""
+        if step < self._warm:
+            return self._warmup_step(points, generator())
+        return self._self_supervised_step(points)
+
+    def network_rate(self, step: int) -> float:
+        """From 1 to `final_rate` along half a cosine."""
+        s = self.schedule
+        return s.final_rate + (1 - s.final_rate) * 0.5 * (1 + math.cos(math.pi * min(step / s.steps, 1)))
+
+    def category_rate(self, step: int) -> float:
+        """Shapes and joints are held during the warm-up."""
+        return 0.0 if step < self._warm else self.schedule.category_rate * self.network_rate(step)
+
+    def kept(self) -> dict[str, Tensor] | None:
+        """The registered clouds, so that training resumes without discovery."""
+        return None if self.found is None else asdict(self.found)
+
+    def restore(self, kept: dict[str, Tensor] | None) -> None:
+        """Take them back."""
+        self.found = None if kept is None else HandOver(**kept)
+
+    @property
+    def _warm(self) -> int:
+        return self.schedule.rigid_steps + self.schedule.warmup_steps
+
+    def _warmup_step(self, points: Tensor, generator: torch.Generator) -> Outcome:
+        """Registered clouds turned afresh: poses are known, so the hypothesis nearest to them trains."""
+        aligned, target = self._registered_clouds(len(points), generator, points.device)
+        category, trained = self.estimator.articulated.category.canonical(), []
+        for iteration in self.estimator.iterate(aligned):
+            still = torch.eye(3, device=points.device)
+            start = still if iteration.start is None else iteration.start.base[:, 0, :3, :3]
+            nearest = self.group.nearest(start.transpose(-1, -2) @ target.base[:, :3, :3])
+            selected = iteration.hypotheses.select(nearest)
+            terms = staged_terms(selected, aligned, category, self.objective, target, follow_category=True)
+            trained.append((terms, selected))
+        return Outcome.of(trained)
+
+    def _registered_clouds(
+        self, size: int, generator: torch.Generator, device: torch.device
+    ) -> tuple[Tensor, PoseTarget]:
+        """A batch of them in random orientations, aligned [B, N, 3], and where the shape is in each."""
+        orientation = self.estimator.observation.orientation
+        index = torch.randint(len(self.found.points), (size,), generator=generator)
+        rotation = orientation.draw(size, generator).to(device)
+        points, base, state = (
+            value[index].to(device) for value in (self.found.points, self.found.base, self.found.state)
+        )
+        if orientation.limited:
+            rotation = rotation @ base[:, :3, :3].mT  # to an orientation within the range
+        turn = se3(rotation, rotation.new_zeros(size, 3))
+        aligned, pose = self.estimator.align(transform_points(turn, points))
+        return aligned, PoseTarget(invert_se3(pose) @ turn @ base, state)
+
+    def _self_supervised_step(self, points: Tensor) -> Outcome:
+        """The best reconstruction of any cloud trains, drawn to where a few rounds of registration move it."""
+        aligned, _ = self.estimator.align(points)
+        category, trained = self.estimator.articulated.category.canonical(), []
+        for iteration in self.estimator.iterate(aligned):
+            winner = iteration.winner
+            selected = iteration.hypotheses.select(winner)
+            target = self._registered(iteration, winner, selected) if self.objective.distillation else None
+            terms = staged_terms(selected, aligned, category, self.objective, target, follow_category=False)
+            trained.append((terms, selected))
+        return Outcome.of(trained)
+
+    def _registered(self, iteration: Iteration, winner: Tensor, selected: Hypotheses) -> PoseTarget:
+        """Where registration moves the winner [B], if that is better; else where it is."""
+        moved = self.estimator.register(selected, iteration.points, _SCALES, _ROUNDS)
+        base, state, after = (value[:, 0] for value in moved)
+        better = after < iteration.distance.gather(1, winner[:, None])[:, 0]
+        return PoseTarget(
+            torch.where(better[:, None, None], base, selected.base[:, 0].detach()),
+            torch.where(better[:, None], state, selected.state[:, 0].detach()),
+        )

@@ -1,0 +1,99 @@
+"""What `lightning test` collects and writes: calibrated metrics, timing, and a picture of typical clouds."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torchmetrics.utilities import dim_zero_cat
+
+from articulate_ssl.inference.pictures.picture import SampleRow, draw_test_samples
+from articulate_ssl.inference.prediction import Prediction
+from articulate_ssl.metrics.articulated_pose import ArticulatedPoseMetrics
+from articulate_ssl.metrics.calibration import calibrate
+from articulate_ssl.metrics.report import write_report
+from datamodules.manifest import Manifest
+
+PICTURE_NAME = "test_samples.png"
+
+
+def concatenate(predictions: list[Prediction]) -> Prediction:
+    """Predictions of several batches as one."""
+    return Prediction(**{f.name: torch.cat([getattr(p, f.name) for p in predictions]) for f in fields(Prediction)})
+
+
+class TestReport:
+    """Scores batches of test clouds against a calibration measured on training clouds.
+
+    Args:
+        predictions: Of the calibration clouds, batch by batch.
+        batches: Those clouds with their labels.
+    """
+
+    __test__ = False  # not a pytest class
+
+    def __init__(self, predictions: list[Prediction], batches: list[dict[str, Tensor]]) -> None:
+        labels = {name: torch.cat([batch[name] for batch in batches]) for name in batches[0]}
+        self.calibration = calibrate(concatenate(predictions), labels)
+        self.metrics = ArticulatedPoseMetrics(self.calibration)
+        self.samples: list[tuple[Tensor, Tensor, Prediction]] = []
+        self.seconds = 0.0
+
+    def to(self, device: torch.device) -> TestReport:
+        """Move calibration and metric states."""
+        self.calibration = self.calibration.to(device)
+        self.metrics.calibration = self.calibration
+        self.metrics.to(device)
+        return self
+
+    def update(self, prediction: Prediction, batch: dict[str, Tensor], seconds: float) -> None:
+        """Add a batch of test clouds that took `seconds` to predict."""
+        self.metrics.update(prediction, batch)
+        self.seconds += seconds
+        nearest = torch.cdist(batch["points"], batch["dense_points"]).argmin(dim=-1)
+        self.samples.append(
+            (batch["points"].cpu(), batch["dense_part_id"].gather(1, nearest).cpu(), prediction.to("cpu"))
+        )
+
+    def write(self, folder: Path, result: dict, manifest: Manifest, checkpoint: str, refined: bool) -> dict:
+        """Write metrics.json, metrics.csv and the picture (of this process's clouds); print the table.
+
+        Args:
+            folder: Where to.
+            result: What `metrics.compute()` returned.
+            manifest: Of the test set.
+            checkpoint: Path of the weights.
+            refined: Whether predictions were refined by registration.
+
+        Returns:
+            The content of metrics.json.
+        """
+        error = dim_zero_cat(self.metrics.r_err_deg).mean(dim=1).cpu()
+        content = write_report(
+            folder,
+            result,
+            category=manifest.category,
+            source=manifest.source,
+            protocol=manifest.protocol or manifest.view,
+            checkpoint=checkpoint,
+            seconds_per_cloud=self.seconds / max(1, sum(len(points) for points, *_ in self.samples)),
+            part_names=list(manifest.part_names),
+            refined=refined,
+            calibration=self.calibration.to_dict(),
+        )
+        self._draw(folder / PICTURE_NAME, error)
+        return content
+
+    def _draw(self, path: Path, error: Tensor) -> None:
+        points = torch.cat([p for p, *_ in self.samples])
+        truth = self.calibration.slot_of_part.cpu()[torch.cat([t for _, t, _ in self.samples])]
+        prediction = concatenate([p for *_, p in self.samples])
+        order = error.argsort()
+        rows = []
+        for name, index in (("best", order[0]), ("median", order[len(order) // 2]), ("worst", order[-1])):
+            i = int(index)
+            title = f"{name}: mean R error {error[i]:.1f}°"
+            rows.append(SampleRow(title, points[i].numpy(), prediction[i : i + 1], truth[i].numpy()))
+        draw_test_samples(rows, path)
