@@ -1,1 +1,1 @@
-"""Lightning DataModules, the npz shard format and the geometry that data and method share."""
+"""Lightning DataModules and the npz shard format."""

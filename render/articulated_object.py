@@ -20,7 +20,7 @@ class Joint:
 
     Attributes:
         name: Unique within the object.
-        type: `REVOLUTE` or `PRISMATIC` (of `datamodules.geometry`).
+        type: `REVOLUTE` or `PRISMATIC` (of `articulate_ssl.geometry.screw`).
         parent: Index of the part nearer to the base.
         child: Index of the part that this joint moves.
         axis: [3] unit direction. Revolute: right-hand rule.

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from importlib import import_module
+from pkgutil import iter_modules
 
 from articulate_ssl.training.recipes.recipe import Recipe
 
-RECIPES = ("staged", "paper")
+RECIPES = tuple(sorted({module.name for module in iter_modules(__path__)} - {"recipe"}))
 
 
 def recipe_class(name: str) -> type[Recipe]:
