@@ -1,13 +1,15 @@
 """Part discovery: find a category's parts and joints from unlabelled clouds alone, by registration.
 
-1. *Rigid alignment* (`references`): each of a few typical clouds is registered to all others from every rotation.
-2. *Propose, fit, select*, for each of them. `proposals` cut it into K pieces; `bodies` register every piece to every
-   aligned cloud on its own; `joint_fit` reduces the motion between them to joints; from there labels, joints and each
-   cloud's proportions descend together (`instance_fit`), the better ones for longer (`selection`). The winner
-   reconstructs best with joints and proportions, which is what a wrong split cannot do. So far every typical cloud is
-   on its own; the one whose shape explains all clouds best, found by a search, stays.
-3. *Rounds*: search every cloud again with the articulated shape, from many orientations (this is what rights clouds
-   that the rigid template fitted upside down), then descend again on the clouds that fit.
+1. *Alignment*. Each of a few typical clouds is registered as a rigid template to all others from every rotation
+   (`references`). Where joints slide and clouds have Manhattan frames, the whole collection is turned into one frame
+   instead (`common_frame`).
+2. *Propose, fit, select*, for each of the typical clouds. `proposals` cut it into K pieces; `bodies` register every
+   piece to every aligned cloud on its own; `joint_fit` reduces the motion between them to joints; from there labels,
+   joints and each cloud's proportions descend together (`instance_fit`), the better ones for longer (`selection`). The
+   winner reconstructs best with joints and proportions, which is what a wrong split cannot do. So far every typical
+   cloud is on its own; the one whose shape explains all clouds best stays.
+3. *Rounds*: register the articulated shape to every cloud again (`registrar`; from many orientations, which is what
+   rights clouds that the rigid template fitted upside down), then descend again on the clouds that fit.
 
 No network, no label. It is to the staged recipe what the "zero iteration" is to the original.
 """
@@ -15,25 +17,26 @@ No network, no label. It is to the staged recipe what the "zero iteration" is to
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from articulate_ssl.discovery.bodies import fit_bodies
+from articulate_ssl.discovery.common_frame import common_frame
 from articulate_ssl.discovery.instance_fit import InstanceFit
 from articulate_ssl.discovery.joint_fit import fit_joints
 from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.discovery.proposals import Scene, load_proposals
-from articulate_ssl.discovery.references import aligned_to, choose_references
+from articulate_ssl.discovery.references import aligned_to, alike, choose_references
 from articulate_ssl.discovery.registered_shape import RegisteredShape, trimmed_mean
-from articulate_ssl.discovery.search import search_articulated
+from articulate_ssl.discovery.registrar import Registrar, SearchingRegistrar, SlidingRegistrar
 from articulate_ssl.discovery.selection import select
 from articulate_ssl.geometry.rotation_group import rotation_group
+from articulate_ssl.geometry.screw import PRISMATIC
+from articulate_ssl.geometry.se3 import se3
 from articulate_ssl.shape.observation import Observation
-
-_STATE_STARTS = 1.5  # standard deviations of the states, on either side of their middle, from which a search starts
 
 log = logging.getLogger(__name__)
 
@@ -54,60 +57,36 @@ def discover(
     Raises:
         DiscoveryError: if no split into `num_parts` moving parts survives.
     """
-    clouds = clouds[:, : options.dense_points].contiguous()
     generator = torch.Generator().manual_seed(options.seed)
+    # Sliding says nothing about orientation, while free registration of what slides turns it wherever it likes.
+    slides = joint_type == PRISMATIC and not observation.orientation.limited
+    frame = common_frame(clouds, generator) if slides else None
+    clouds = clouds[:, : options.dense_points].contiguous()
     rotations = rotation_group(60).elements.to(clouds)
-    registrar = Registrar(rotations[observation.orientation.contains(rotations)], options, generator, observation)
+    rotations = rotations[observation.orientation.contains(rotations)]
+    if frame is not None:
+        clouds, registrar = clouds @ frame.mT, SlidingRegistrar(options, generator)
+    else:
+        registrar = SearchingRegistrar(options, generator, rotations, observation)
     few = clouds[:: max(1, len(clouds) // options.search_clouds)][: options.search_clouds]
-    found = _best_reference(clouds, few, num_parts, joint_type, registrar)
-    found = _rounds(found, clouds, few, registrar)
+    references = clouds[choose_references(clouds, options.references)]
+    aligned = (
+        aligned_to(one, few, rotations, options) if frame is None else alike(one, few, options) for one in references
+    )
+    scenes = (
+        Scene(one, others, num_parts, joint_type, options, observation, generator, frame is not None)
+        for one, others in zip(references, aligned, strict=True)
+    )
+    found = _rounds(_best_reference(scenes, few, registrar, num_parts), clouds, few, registrar)
     if len(found.error) < len(clouds):
         found = registrar.register(found, clouds)
-    return found
+    return found if frame is None else replace(found, base=se3(frame.mT, frame.new_zeros(3)) @ found.base)
 
 
-class Registrar(NamedTuple):
-    """Registers a shape to clouds: of a search's candidates, the one that fits best when stretched.
-
-    Attributes:
-        rotations: [H, 3, 3] from which clouds are searched.
-        options: How much work to do.
-        generator: Of everything random.
-        observation: How far objects are turned.
-    """
-
-    rotations: Tensor
-    options: DiscoveryOptions
-    generator: torch.Generator
-    observation: Observation
-
-    def register(self, found: RegisteredShape, clouds: Tensor) -> RegisteredShape:
-        """The shape of a registration, registered to other clouds [n, N, 3]."""
-        few_cycles = self.options.few_cycles
-        shape = found.limited()
-        base, state, _ = search_articulated(shape, clouds, self.rotations, _state_starts(found.state))
-        copies = clouds.repeat_interleave(base.shape[1], dim=0)
-        fit = InstanceFit(shape, base.flatten(0, 1), state.flatten(0, 1), self.generator)
-        fit.optimise(copies, few_cycles, shared=False)
-        # A hypothesis that leaves a part unexplained is to pay for it.
-        error = fit.error(copies, softened=False).unflatten(0, base.shape[:2])
-        best = self.observation.ranked(error, base[..., :3, :3]).argmin(dim=1)
-        rows = torch.arange(len(clouds), device=clouds.device)
-        base, state = (value.unflatten(0, error.shape)[rows, best] for value in (fit.base, fit.state))
-        fit = InstanceFit(shape, base, state, self.generator)
-        fit.optimise(clouds, 2 * few_cycles, shared=False)
-        registered = replace(RegisteredShape.of(fit, clouds), shape=found.shape)
-        return registered.turned_to_mean() if self.observation.orientation.limited else registered
-
-
-def _best_reference(
-    clouds: Tensor, few: Tensor, num_parts: int, joint_type: int, registrar: Registrar
-) -> RegisteredShape:
+def _best_reference(scenes: Iterator[Scene], few: Tensor, registrar: Registrar, num_parts: int) -> RegisteredShape:
     """Of the typical clouds, split and jointed, the one that explains `few` clouds best."""
     options, candidates = registrar.options, []
-    for reference in clouds[choose_references(clouds, options.references)]:
-        aligned = aligned_to(reference, few, registrar.rotations, options)
-        scene = Scene(reference, aligned, num_parts, joint_type, options, registrar.observation, registrar.generator)
+    for scene in scenes:
         found = split(scene)
         if found is not None:
             candidates.append(registrar.register(found, few))
@@ -126,19 +105,21 @@ def split(scene: Scene) -> RegisteredShape | None:
     None if in every split a part is lost or does not move.
     """
     splits = [one for propose in load_proposals(scene.options.proposals) for one in propose(scene)]
-    turned = not scene.observation.orientation.limited
-    jointed = [fit_joints(bodies, scene.thin, scene.joint_type, turned) for bodies in fit_bodies(splits, scene)]
-    fits = [InstanceFit(found.shape, found.base, found.state, scene.generator) for found in jointed]
-    best = select(fits, scene.aligned, scene.options)
+    # Who proposes how pieces move, too, has seen more than free registration of the pieces would.
+    jointed = [one.registered for one in splits if one.registered is not None]
+    if not jointed:
+        turned = not scene.observation.orientation.limited
+        jointed = [fit_joints(bodies, scene.thin, scene.joint_type, turned) for bodies in fit_bodies(splits, scene)]
+    best = select([found.fit(scene.generator) for found in jointed], scene.aligned, scene.options)
     return None if best is None else _found(best, scene.aligned)
 
 
 def _rounds(found: RegisteredShape, clouds: Tensor, few: Tensor, registrar: Registrar) -> RegisteredShape:
-    """Descend on the clouds that fit, search again; the last search is in all clouds."""
+    """Descend on the clouds that fit, register again; the last time to all clouds."""
     options = registrar.options
     for step in range(options.rounds):
         kept = found.error.argsort()[: options.kept(len(few))]
-        fit = InstanceFit(found.shape, found.base[kept], found.state[kept], registrar.generator)
+        fit = found.fit(registrar.generator, kept)
         fit.optimise(few[kept], options.cycles, keep=options.keep)
         if fit.shape.smallest_share < options.min_share:
             log.warning("round %d lost a part; keeping the parts of the round before", step + 1)
@@ -156,10 +137,3 @@ def _found(fit: InstanceFit, clouds: Tensor) -> RegisteredShape:
 
 def _error(found: RegisteredShape, options: DiscoveryOptions) -> float:
     return trimmed_mean(found.error, options.kept(len(found.error)))
-
-
-def _state_starts(state: Tensor) -> Tensor:
-    """The middle, and every combination of either side: [1 + 2^J, J]."""
-    spread = _STATE_STARTS * state.std(dim=0)
-    states = torch.cartesian_prod(*torch.stack([-spread, spread], dim=-1)).view(-1, len(spread))
-    return torch.cat([torch.zeros_like(states[:1]), states])

@@ -26,6 +26,7 @@ _SOFTNESS = 0.05
 # Largest log-stretch: a part is at most 1.4 times as long or as short as the template's. Chosen, not tuned, as is the
 # network's `stretch_bound` of .3.
 _BOUND = 0.35
+_START = 0.95  # of the bound: a start beyond is one here, where the gradient still lives
 _RIDGE = 1e-3  # weight of the squared log-stretch: decides what the clouds leave open
 _RATE = 0.01  # of Adam, at the start
 _LAST_RATE = 0.02  # what is left of it in the last cycle
@@ -45,14 +46,27 @@ class InstanceFit:
         base: [n, 4, 4] start.
         state: [n, J] start.
         generator: Of the points drawn.
+        axes: [K, 3, 3] columns along which parts stretch instead; joint axes then stay as they are.
+        log_stretch: [n, K, 3] start; none by default.
     """
 
-    def __init__(self, shape: ArticulatedShape, base: Tensor, state: Tensor, generator: torch.Generator) -> None:
+    def __init__(
+        self,
+        shape: ArticulatedShape,
+        base: Tensor,
+        state: Tensor,
+        generator: torch.Generator,
+        axes: Tensor | None = None,
+        log_stretch: Tensor | None = None,
+    ) -> None:
         self._shape, self._base, self._generator = shape, base, generator
         self._axis, self._pivot, self._state = shape.joints.axis.clone(), shape.joints.pivot.clone(), state.clone()
         self._turn, self._shift = (base.new_zeros(len(base), 3) for _ in range(2))
         self._stretch = base.new_zeros(len(base), shape.num_parts, 3)
-        self._axes = torch.eye(3).to(base).repeat(shape.num_parts, 1, 1)
+        if log_stretch is not None:
+            self._stretch += _BOUND * (log_stretch / _BOUND).clamp(-_START, _START).atanh()
+        self.axes = axes
+        self._axes = torch.eye(3).to(base).repeat(shape.num_parts, 1, 1) if axes is None else axes
         self._center = shape.points.mean(dim=0)
         self._measure_parts()
 
@@ -88,7 +102,7 @@ class InstanceFit:
         pivots[joint] = pivot
         moved = replace(shape, joints=replace(shape.joints, pivot=pivots))
         state = moved.read_states(shape.joints.part_pose(base, state))
-        other = InstanceFit(moved, base, state, self._generator)
+        other = InstanceFit(moved, base, state, self._generator, self.axes)
         other._stretch = self._stretch.clone()
         return other
 
@@ -106,7 +120,9 @@ class InstanceFit:
             keep: Share of the clouds, best fitted first, that count.
         """
         own = [self._state, self._turn, self._shift, self._stretch]
-        parameters = [self._axis, self._pivot, *own] if shared else own
+        # In a frame that clouds have in common, what slides slides along one of its axes, exactly.
+        lines = [self._axis, self._pivot] if self.axes is None else [self._pivot]
+        parameters = lines + own if shared else own
         optimizer = torch.optim.Adam([p.requires_grad_() for p in parameters], lr=_RATE)
         for cycle in range(cycles):
             for group in optimizer.param_groups:
@@ -169,7 +185,8 @@ class InstanceFit:
             points = self._shape.part(part)
             if len(points) < MIN_POINTS:
                 continue
-            self._axes[part] = principal_directions(points)
+            if self.axes is None:
+                self._axes[part] = principal_directions(points)
             if part == self._shape.joints.chain.root:
                 self._center = points.mean(dim=0)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-PROPOSALS = ("random_cuts", "slabs", "restless_points")
+PROPOSALS = ("random_cuts", "slabs", "restless_points", "slides")
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from articulate_ssl.discovery.options import DiscoveryOptions
-from articulate_ssl.discovery.registration import register_rigid
+from articulate_ssl.discovery.registration import chamfer_l1, register_rigid
+from articulate_ssl.discovery.synchronization import unit_boxes
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
 
 _FEWEST_POINTS = 64  # of rigid alignment, however few points registration has otherwise
@@ -50,3 +51,17 @@ def aligned_to(
     log.info("rigid alignment: median Chamfer-L1 %.4f", error[:, 0].median())
     best = error[:, 0].argsort()[: options.split_clouds]
     return transform_points(invert_se3(rigid[best, 0]), clouds[best])
+
+
+def alike(
+    reference: Tensor,  # [N, 3]
+    clouds: Tensor,  # [n, N, 3] in a frame they have in common
+    options: DiscoveryOptions,
+) -> Tensor:  # [split_clouds, N, 3]
+    """The clouds that are most like the reference when both are stretched to unit boxes.
+
+    What slides shows best between objects of like proportions.
+    """
+    boxes = unit_boxes(torch.cat([reference[None], clouds]))[0][:, : options.points]
+    distance = chamfer_l1(boxes[1:], boxes[:1].expand(len(clouds), -1, -1))
+    return clouds[distance.argsort()[: options.split_clouds]]

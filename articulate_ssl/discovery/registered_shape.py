@@ -31,6 +31,8 @@ class RegisteredShape:
         state: [n, J] joint states.
         log_stretch: [n, K, 3] of every part along its principal axes (`shape.stretch`).
         error: [n] distance of every cloud to its reconstruction, stretched to its proportions (`InstanceFit.error`).
+        axes: [K, 3, 3] columns along which parts stretch, where these are not their principal axes: the axes of the
+            frame that clouds have in common.
     """
 
     shape: ArticulatedShape
@@ -38,11 +40,18 @@ class RegisteredShape:
     state: Tensor
     log_stretch: Tensor
     error: Tensor
+    axes: Tensor | None = None
 
     @staticmethod
     def of(fit: InstanceFit, clouds: Tensor) -> RegisteredShape:
         """What an instance fit says about its clouds [n, N, 3]."""
-        return RegisteredShape(fit.shape, fit.base, fit.state, fit.log_stretch, fit.error(clouds, softened=False))
+        error = fit.error(clouds, softened=False)
+        return RegisteredShape(fit.shape, fit.base, fit.state, fit.log_stretch, error, fit.axes)
+
+    def fit(self, generator: torch.Generator, rows: Tensor | slice = slice(None)) -> InstanceFit:
+        """An instance fit to go on from here, on some of the clouds; stretches along principal axes start anew."""
+        start = None if self.axes is None else self.log_stretch[rows]
+        return InstanceFit(self.shape, self.base[rows], self.state[rows], generator, self.axes, start)
 
     def part_pose(self) -> Tensor:
         """[n, K, 4, 4] canonical object space -> cloud."""

@@ -32,12 +32,29 @@ from articulate_ssl.metrics.functional import (
     state_error,
     translation_error,
 )
+from articulate_ssl.metrics.kinematic_tree import root_correct, tree_correct
 from articulate_ssl.metrics.statistics import summarize
+from articulate_ssl.metrics.symmetry import measured_symmetries, pool, rest_clouds, symmetric_rotation_error
 
-PER_PART = ("r_err_deg", "t_err", "flip_rate", "seg_miou", "legacy_r_err_deg", "legacy_t_err", "legacy_seg_miou")
+PER_PART = (
+    "r_err_deg",
+    "r_err_sym_deg",
+    "t_err",
+    "flip_rate",
+    "above_30_rate",
+    "seg_miou",
+    "legacy_r_err_deg",
+    "legacy_t_err",
+    "legacy_seg_miou",
+)
 PER_JOINT = ("axis_err_deg", "pivot_err", "state_err", "legacy_pivot_err")
-PER_CLOUD = ("chamfer_l1", "legacy_axis_err_deg", "legacy_chamfer_l1")
+PER_CLOUD = ("chamfer_l1", "tree_accuracy", "root_accuracy", "legacy_axis_err_deg", "legacy_chamfer_l1")
+# Known only when all clouds of an instance were seen.
+AT_THE_END = ("r_err_sym_deg",)
+REST = ("points", "part_id", "part_center", "joint_axis", "joint_pivot")  # of `rest_clouds`
+ANY_PART = ("flip_rate", "above_30_rate")  # true of a cloud if of any part
 FLIP_DEG = 90.0
+ABOVE_DEG = 30.0  # a cabinet turned by 78 degrees is wrong, and no flip; chosen without a measurement
 
 
 def part_pose_errors(
@@ -93,6 +110,17 @@ def joint_errors(
     }
 
 
+def relative_rotation(
+    prediction: Prediction,
+    labels: dict[str, Tensor],
+    calibration: Calibration,
+) -> Tensor:  # [B, K, 3, 3] float64
+    """R_true^T R_predicted of every part: its angle is the rotation error."""
+    predicted = gather_rows(prediction.part_pose, calibration.slot_of_part.expand(prediction.part_pose.shape[:2]))
+    target = labels["part_pose"].double()[..., :3, :3]
+    return target.transpose(-1, -2) @ predicted[..., :3, :3] @ calibration.residual_rotation
+
+
 @torch.no_grad()
 def cloud_errors(
     prediction: Prediction,
@@ -103,8 +131,8 @@ def cloud_errors(
 
     Returns:
         [B, K] for part errors, [B, J] for joint errors, [B] for the rest; float64. Angles are in degrees. NaN only
-        where a quantity does not exist: the pivot of a prismatic joint, the IoU of a part that is in neither the
-        labelled nor the predicted segmentation.
+        where a quantity does not exist: the pivot of a prismatic joint, the tree of two parts, the IoU of a part that
+        is in neither the labelled nor the predicted segmentation. `AT_THE_END` is missing.
 
     Raises:
         ValueError: if the labels do not belong to the prediction (`check_labels`).
@@ -127,8 +155,11 @@ def cloud_errors(
         "r_err_deg": rotation.rad2deg(),
         "t_err": translation,
         "flip_rate": (rotation.rad2deg() > FLIP_DEG).double(),
+        "above_30_rate": (rotation.rad2deg() > ABOVE_DEG).double(),
         "seg_miou": iou.gather(1, slot[:, None]).squeeze(1),
         "chamfer_l1": chamfer_l1(points, reconstruction),
+        "tree_accuracy": tree_correct(prediction, calibration),
+        "root_accuracy": root_correct(prediction, calibration),
         "legacy_r_err_deg": legacy_fold(legacy_rotation).rad2deg(),
         "legacy_t_err": legacy_translation,
         "legacy_seg_miou": iou.gather(1, legacy_slot[:, None]).squeeze(1),
@@ -154,7 +185,8 @@ class ArticulatedPoseMetrics(Metric):
         self.calibration = calibration
         self.replicates = replicates
         self.seed = seed
-        for name in ("instance", *PER_PART, *PER_JOINT, *PER_CLOUD):
+        measured = [name for name in (*PER_PART, *PER_JOINT, *PER_CLOUD) if name not in AT_THE_END]
+        for name in ("instance", "relative_rotation", *(f"rest_{name}" for name in REST), *measured):
             self.add_state(name, default=[], dist_reduce_fx="cat")
 
     def update(self, prediction: Prediction, labels: dict[str, Tensor]) -> None:
@@ -169,6 +201,10 @@ class ArticulatedPoseMetrics(Metric):
         """
         for name, errors in cloud_errors(prediction, labels, self.calibration).items():
             getattr(self, name).append(errors)
+        calibration = self.calibration.to(prediction.part_pose.device)
+        self.relative_rotation.append(relative_rotation(prediction, labels, calibration))
+        for name, values in rest_clouds(labels).items():
+            getattr(self, f"rest_{name}").append(values)
         self.instance.append(labels["instance"].long())
 
     def compute(self) -> dict:
@@ -177,9 +213,10 @@ class ArticulatedPoseMetrics(Metric):
         Returns:
             For every quantity of design section 4 a dict with `mean`, `median` and `ci95` (bootstrap over instances, of
             the mean; None with fewer than two instances) of each cloud's average over its parts or joints, and the same
-            three for every single part or joint in the lists `parts` or `joints`. `flip_rate` has a cloud count as
-            flipped if any part is. Values that do not exist (the pivot of a prismatic joint) are None. Beside them
-            `samples` and `failures` (0: no cloud is ever dropped).
+            three for every single part or joint in the lists `parts` or `joints`. `flip_rate` and `above_30_rate` have
+            a cloud count if any part does. Values that do not exist (the pivot of a prismatic joint) are None. Beside
+            them `samples`, `failures` (0: no cloud is ever dropped), `instances`, and `symmetric_instances`, those of
+            them with a symmetry besides the identity (`metrics/symmetry.py`).
 
         Raises:
             ValueError: if nothing was added.
@@ -187,19 +224,35 @@ class ArticulatedPoseMetrics(Metric):
         if not len(self.instance):
             raise ValueError("no test cloud was scored: the test set is empty")
         instance = dim_zero_cat(self.instance)
+        at_the_end, counts = self._modulo_symmetry(instance)
         result: dict = {}
         for name in (*PER_PART, *PER_JOINT, *PER_CLOUD):
-            values = dim_zero_cat(getattr(self, name))
+            values = at_the_end[name] if name in AT_THE_END else dim_zero_cat(getattr(self, name))
             if values.ndim == 1:
                 result[name] = self._summary(values, instance)
                 continue
-            average = values.amax(1) if name == "flip_rate" else values.nanmean(1)
+            average = values.amax(1) if name in ANY_PART else values.nanmean(1)
             if name == "state_err" and len({*self.calibration.joint_type.tolist()}) > 1:
                 average = torch.full_like(average, torch.nan)  # degrees and lengths have no common mean
             result[name] = self._summary(average, instance)
             single = "parts" if name in PER_PART else "joints"
             result[name][single] = [self._summary(column, instance) for column in values.unbind(1)]
-        return result | {"samples": len(instance), "failures": 0}
+        return result | {"samples": len(instance), "failures": 0} | counts
+
+    def _modulo_symmetry(self, instance: Tensor) -> tuple[dict[str, Tensor], dict[str, int]]:
+        """`AT_THE_END`, every one [S, K], and how many instances there are and are symmetric."""
+        error, relative = dim_zero_cat(self.r_err_deg).clone(), dim_zero_cat(self.relative_rotation)
+        rest = {name: dim_zero_cat(getattr(self, f"rest_{name}")) for name in REST}
+        instances, symmetric = instance.unique(), 0
+        for one in instances:
+            own = instance == one
+            clouds = {name: values[own] for name, values in rest.items()}
+            symmetries = measured_symmetries(pool(clouds, self.calibration.joint_type))
+            # Without a symmetry the error stays what it is, to the last digit.
+            if len(symmetries) > 1:
+                error[own] = symmetric_rotation_error(relative[own], symmetries).rad2deg()
+                symmetric += 1
+        return {"r_err_sym_deg": error}, {"instances": len(instances), "symmetric_instances": symmetric}
 
     def _summary(self, values: Tensor, instance: Tensor) -> dict:
         return summarize(values, instance, self.replicates, self.seed)

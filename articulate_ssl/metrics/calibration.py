@@ -276,7 +276,7 @@ def check_labels(prediction: Prediction, labels: dict[str, Tensor]) -> None:
             predicted poses or joints are not finite.
     """
     needed = {"points", "part_pose", "part_center", "joint_axis", "joint_pivot", "joint_state", "joint_parent"}
-    needed |= {"joint_child", "joint_type", "dense_points", "dense_part_id", "instance"}
+    needed |= {"joint_child", "joint_type", "dense_points", "dense_part_id", "instance", "scale"}
     if missing := sorted(needed - set(labels)):
         raise ValueError(f"labels lack the arrays {', '.join(missing)}")
     clouds, parts = prediction.part_pose.shape[:2]

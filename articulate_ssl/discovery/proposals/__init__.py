@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from articulate_ssl.discovery.options import PROPOSALS, DiscoveryOptions
+from articulate_ssl.discovery.registered_shape import RegisteredShape
 from articulate_ssl.shape.observation import Observation
 
 
@@ -29,6 +30,7 @@ class Scene(NamedTuple):
         options: How much work to do.
         observation: How far objects are turned.
         generator: Of everything random.
+        framed: Whether template and clouds stand in a frame that all have in common, along its axes.
     """
 
     template: Tensor
@@ -38,6 +40,7 @@ class Scene(NamedTuple):
     options: DiscoveryOptions
     observation: Observation
     generator: torch.Generator
+    framed: bool = False
 
     @property
     def thin(self) -> Tensor:
@@ -52,10 +55,12 @@ class Split(NamedTuple):
         label: [T] int64 pieces 0..K-1.
         refined: Whether points are given to the piece that explains them best while pieces are registered. What is cut
             small on purpose would drown in that.
+        registered: How the pieces move, and where they are in the aligned clouds, if the proposal found that too.
     """
 
     label: Tensor
     refined: bool
+    registered: RegisteredShape | None = None
 
 
 Proposal = Callable[[Scene], list[Split]]

@@ -54,7 +54,7 @@ def test_ground_truth_in_zero_error_out(num_parts, tree, joint_type):
                     assert single["ci95"][0] <= single["mean"] + 1e-12
 
 
-@pytest.mark.parametrize("degrees", [0.5, 30.0, 89.0, 91.0, 150.0, 179.5])
+@pytest.mark.parametrize("degrees", [0.5, 29.9, 31.0, 78.0, 89.0, 91.0, 150.0, 179.5])
 def test_a_known_rotation_error_comes_out_unfolded(degrees):
     labels = articulated_labels(num_parts=3)
     truth, slot_of_part = disguise(perfect_oracle(labels), seed=2)
@@ -65,6 +65,8 @@ def test_a_known_rotation_error_comes_out_unfolded(degrees):
     assert result["legacy_r_err_deg"]["parts"][1]["mean"] == pytest.approx(min(degrees, 180 - degrees), abs=1e-3)
     assert result["flip_rate"]["parts"][1]["mean"] == float(degrees > 90)
     assert result["flip_rate"]["mean"] == float(degrees > 90)
+    assert result["above_30_rate"]["parts"][0]["mean"] == 0
+    assert result["above_30_rate"]["mean"] == result["above_30_rate"]["parts"][1]["mean"] == float(degrees > 30)
 
 
 def test_flip_rate_counts_clouds_with_any_flipped_part():
@@ -75,6 +77,18 @@ def test_flip_rate_counts_clouds_with_any_flipped_part():
     result = score(flipped, labels, truth, labels)["flip_rate"]
     assert result["mean"] == pytest.approx(0.25)
     assert [part["mean"] for part in result["parts"]] == pytest.approx([0.2, 0.25])
+
+
+def test_above_30_counts_clouds_with_any_such_part():
+    labels = articulated_labels(clouds=20, num_parts=2)
+    truth = perfect_oracle(labels)
+    off = part_turn(truth, torch.where(torch.arange(20) < 4, 78.0, 10.0), part=0)
+    off = part_turn(off, torch.where(torch.arange(20) >= 17, 31.0, 29.0), part=1)
+    result = score(off, labels, truth, labels)
+    assert result["above_30_rate"]["mean"] == pytest.approx(7 / 20)
+    assert [part["mean"] for part in result["above_30_rate"]["parts"]] == pytest.approx([4 / 20, 3 / 20])
+    assert len(result["above_30_rate"]["ci95"]) == 2
+    assert result["flip_rate"]["mean"] == 0
 
 
 def test_a_known_displacement_comes_out():
@@ -229,11 +243,19 @@ def test_every_quantity_of_the_contract_is_there():
         "seg_miou",
         "chamfer_l1",
     } <= set(result)
-    assert set(result) == {*PER_PART, *PER_JOINT, *PER_CLOUD, "samples", "failures"}
+    assert set(result) == {*PER_PART, *PER_JOINT, *PER_CLOUD, "samples", "failures", "instances", "symmetric_instances"}
     for name in (*PER_PART, *PER_JOINT, *PER_CLOUD):
         assert {"mean", "median", "ci95"} <= set(result[name])
     assert [len(result[name]["parts"]) for name in PER_PART] == [3] * len(PER_PART)
     assert [len(result[name]["joints"]) for name in PER_JOINT] == [2] * len(PER_JOINT)
+
+
+def test_keys_of_older_reports_keep_their_order():
+    result = score(perfect_oracle(labels := articulated_labels()), labels)
+    older = ["r_err_deg", "t_err", "flip_rate", "seg_miou", "legacy_r_err_deg", "legacy_t_err", "legacy_seg_miou"]
+    older += ["axis_err_deg", "pivot_err", "state_err", "legacy_pivot_err"]
+    older += ["chamfer_l1", "legacy_axis_err_deg", "legacy_chamfer_l1", "samples", "failures"]
+    assert [name for name in result if name in older] == older
 
 
 def test_batches_add_up_and_reset_forgets():

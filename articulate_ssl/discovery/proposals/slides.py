@@ -1,0 +1,63 @@
+"""Sliding parts: pieces that slide alike along one axis of a common frame; cuts cannot part a body from its drawers."""
+
+from __future__ import annotations
+
+import torch
+
+from articulate_ssl.discovery.distance_field import DistanceFields
+from articulate_ssl.discovery.proposals import Scene, Split
+from articulate_ssl.discovery.registered_shape import RegisteredShape
+from articulate_ssl.discovery.slide_table import (
+    DIRECTIONS,
+    Direction,
+    Slides,
+    Standing,
+    cluster_slides,
+    offset_costs,
+    place,
+)
+from articulate_ssl.geometry.kinematic_chain import KinematicChain
+from articulate_ssl.geometry.screw import PRISMATIC
+from articulate_ssl.shape.articulated_shape import ArticulatedShape
+from articulate_ssl.shape.joints import Joints
+
+_RESTARTS = 40  # random starts of a clustering
+
+
+def propose(scene: Scene) -> list[Split]:
+    """The best clustering for every direction; none where clouds have no common frame, or joints turn."""
+    if not scene.framed or scene.joint_type != PRISMATIC:
+        return []
+    found = [_propose(scene, direction) for direction in DIRECTIONS]
+    return [split for split in found if split is not None]
+
+
+def _propose(scene: Scene, direction: Direction) -> Split | None:
+    options, template = scene.options, scene.template
+    own, standing = Standing.of(template[None], direction), Standing.of(scene.aligned, direction)
+    fields, clouds = DistanceFields.of(standing.points), range(len(scene.aligned))
+    table = torch.stack([offset_costs(own.points[0], fields, cloud, direction) for cloud in clouds], dim=1)
+    slides = cluster_slides(table, scene.num_parts, options.min_share, _RESTARTS, scene.generator)
+    if slides is None:
+        return None
+    shape = _star(template, slides, direction, float(own.width[0, direction.axis]))
+    base, state, log_stretch = (value[:, 0] for value in place(shape, scene.aligned, options.points))
+    error = torch.full((len(base),), slides.cost).to(template)
+    axes = torch.eye(3).to(template).expand(scene.num_parts, 3, 3)
+    return Split(slides.label, refined=False, registered=RegisteredShape(shape, base, state, log_stretch, error, axes))
+
+
+def _star(template: torch.Tensor, slides: Slides, direction: Direction, unit: float) -> ArticulatedShape:
+    """The piece that moves least is the root, all others slide on it; at state zero they are where they mostly are."""
+    root = int(slides.offset.std(dim=1).argmin())
+    children = [part for part in range(len(slides.offset)) if part != root]
+    vector = direction.vector(template)
+    points = template.clone()
+    for part in children:
+        middle = (slides.offset[part] - slides.offset[root]).median() * unit
+        points[slides.label == part] += middle * vector
+    points = points - points.mean(dim=0)
+    pivot = torch.stack([points[slides.label == part].mean(dim=0) for part in children])
+    chain = KinematicChain(len(slides.offset), root, (root,) * len(children), tuple(children))
+    axis = vector.expand(len(children), 3).clone()
+    return ArticulatedShape(points, slides.label, Joints(chain, axis, pivot, PRISMATIC))

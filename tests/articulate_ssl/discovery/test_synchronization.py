@@ -1,0 +1,54 @@
+"""A collection decides together what its pairs, and its single members, get wrong."""
+
+import pytest
+import torch
+
+from articulate_ssl.discovery.synchronization import pairwise_costs, synchronise, total_cost, unit_boxes
+from articulate_ssl.geometry.rotation_group import rotation_group
+
+
+def _planted(group, count: int, wrong: float, generator) -> tuple[torch.Tensor, torch.Tensor]:
+    """Elements of the clouds, and costs whose cheapest relative element is right for all but a share of the pairs."""
+    element = torch.randint(len(group), (count,), generator=generator)
+    right = group.product[group.inverse[element]][:, element]  # a_i^{-1} a_j
+    noise = torch.randint(len(group), (count, count), generator=generator)
+    chosen = torch.where(torch.rand(count, count, generator=generator) < wrong, noise, right)
+    costs = 1 + 0.1 * torch.rand(count, count, len(group), generator=generator)
+    costs.scatter_(2, chosen[..., None], 0.5)
+    return element, costs + costs.transpose(0, 1)[..., group.inverse]
+
+
+@pytest.mark.parametrize("order", [12, 24])
+def test_all_pairs_together_decide_what_two_thirds_of_them_get_wrong(order):
+    group, generator = rotation_group(order), torch.Generator().manual_seed(0)
+    element, costs = _planted(group, 40, wrong=0.65, generator=generator)
+    relative = group.product[group.inverse[element]][:, element]
+    pairs = (costs.argmin(dim=-1) == relative).float().mean()
+    found = synchronise(costs, group, generator)
+    # The same up to one common element: h a_i.
+    common = group.product[found, group.inverse[element]]
+    assert pairs < 0.7
+    assert (common == common.mode().values).all()
+    assert total_cost(costs, found, group) == pytest.approx(total_cost(costs, element, group), rel=1e-5)
+
+
+def test_a_common_element_changes_no_cost():
+    group, generator = rotation_group(24), torch.Generator().manual_seed(1)
+    element, costs = _planted(group, 10, wrong=0.3, generator=generator)
+    turned = group.product[torch.tensor(7), element]
+    assert total_cost(costs, turned, group) == pytest.approx(total_cost(costs, element, group), rel=1e-6)
+
+
+def test_a_turned_cloud_costs_least_under_the_rotation_that_undoes_it():
+    group, generator = rotation_group(24), torch.Generator().manual_seed(0)
+    shape = torch.rand(600, 3, generator=generator) - 0.5
+    shape = shape[(shape.prod(dim=1) > 0) | (shape[:, 0] > 0.2)]  # no symmetry
+    elements = torch.tensor([0, 5, 17])
+    turned = torch.stack([shape @ group.elements[e].float().T for e in elements])
+    boxes, center, width = unit_boxes(3 * turned + 1)
+    assert boxes.abs().max() < 0.6
+    torch.testing.assert_close(boxes * width[:, None] + center[:, None], 3 * turned + 1)
+    costs = pairwise_costs(boxes, group)
+    # Cloud j turned by a_i a_j^{-1} is cloud i.
+    assert torch.equal(costs.argmin(dim=-1), group.product[elements][:, group.inverse[elements]])
+    torch.testing.assert_close(costs, costs.transpose(0, 1)[..., group.inverse])
