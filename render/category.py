@@ -8,7 +8,7 @@ Convention:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import resources
 from math import radians
@@ -99,6 +99,8 @@ class CategorySpec:
         min_visible_points: Fewest points of a stored partial cloud that every part must have.
         recognition: How to find the category's parts in foreign objects; None for `articulated`, whose `parts` and
             `joints` are empty because it takes every object as it is.
+        variants: Options of the procedural design by the name of a variant of the category.
+        variant: The variant that this is; None for the category itself.
     """
 
     name: str
@@ -109,6 +111,13 @@ class CategorySpec:
     view: ViewSpec
     min_visible_points: int
     recognition: RecognitionSpec | None = None
+    variants: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    variant: str | None = None
+
+    @property
+    def design_options(self) -> Mapping[str, Any]:
+        """Options of the procedural design: those of the variant."""
+        return self.variants[self.variant] if self.variant else {}
 
     def of(self, instance: ArticulatedObject) -> CategorySpec:
         """The specification itself; for `articulated`, one with the parts of the instance and its joints' limits."""
@@ -166,16 +175,19 @@ def category_names() -> tuple[str, ...]:
 
 
 @cache
-def load_category(name: str) -> CategorySpec:
-    """The specification of a category.
+def load_category(name: str, variant: str | None = None) -> CategorySpec:
+    """The specification of a category, or of a variant that its file names under `variants`.
 
     Raises:
-        ValueError: if there is no such category.
+        ValueError: if there is no such category or variant.
     """
     if name not in category_names():
         raise ValueError(f"unknown category {name!r}; choose one of {', '.join(category_names())}")
     text = (resources.files("render.categories") / f"{name}.yaml").read_text(encoding="utf-8")
     content = yaml.safe_load(text)
+    variants = content.get("variants", {})
+    if variant is not None and variant not in variants:
+        raise ValueError(f"category {name!r} has no variant {variant!r}; it has {', '.join(variants) or 'none'}")
     parts, view = tuple(content["parts"]), content["view"]
     return CategorySpec(
         name=name,
@@ -191,6 +203,8 @@ def load_category(name: str) -> CategorySpec:
         ),
         min_visible_points=content["min_visible_points"],
         recognition=RecognitionSpec(**content["recognition"]) if content["joints"] else None,
+        variants=variants,
+        variant=variant,
     )
 
 

@@ -99,7 +99,7 @@ def split_instances(options: SetOptions) -> dict[str, tuple[str, ...]]:
     Raises:
         ValueError: if the source has too few instances.
     """
-    ids = _open(options.category, options.source, options.root, options.seed).instance_ids()
+    ids = _open(options).instance_ids()
     train, test = options.train_instances, options.test_instances
     if train + test > len(ids):
         raise ValueError(
@@ -109,13 +109,14 @@ def split_instances(options: SetOptions) -> dict[str, tuple[str, ...]]:
     return {"train": tuple(ids[:train]), "test": tuple(ids[train : train + test])}
 
 
-def _open(category: str, source: str, root: str | None, seed: int) -> Source:
-    return open_source(source, load_category(category), None if root is None else Path(root), seed)
+def _open(options: SetOptions | argparse.Namespace) -> Source:
+    spec, root = load_category(options.category, options.variant), None if options.root is None else Path(options.root)
+    return open_source(options.source, spec, root, options.seed)
 
 
 def _left_out(options: SetOptions, ids: dict[str, tuple[str, ...]]) -> dict[str, str]:
     """Why, by id, objects of the source are not in the set; the procedural source has no end to be left out of."""
-    source = _open(options.category, options.source, options.root, options.seed)
+    source = _open(options)
     left_out = dict(source.left_out())
     if options.root is not None:
         counts = f"--train-instances {options.train_instances} and --test-instances {options.test_instances}"
@@ -268,6 +269,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--category", required=True, choices=category_names())
     add("--source", default="procedural", choices=tuple(SOURCES))
     add("--root", help="folder of an external source's data set")
+    add("--variant", help="of the category's procedural designs, as its specification names it: both_sides of safe")
     add("--view", default="complete", choices=VIEWS)
     add("--protocol", default="honest", choices=PROTOCOLS, help="of partial views")
     add("--out", type=Path, default=Path("data"))
@@ -307,7 +309,7 @@ def options_from(arguments: argparse.Namespace) -> SetOptions:
         raise ValueError(f"source {arguments.source!r} {need} --root")
     if not 0 <= arguments.noise_std < 1:
         raise ValueError(f"--noise-std must be in [0, 1), not {arguments.noise_std}")
-    ids = _open(spec.name, arguments.source, arguments.root, arguments.seed).instance_ids()
+    ids = _open(arguments).instance_ids()
     train, test = default_split(spec, len(ids))
     train = train if arguments.train_instances is None else arguments.train_instances
     test = test if arguments.test_instances is None else arguments.test_instances
@@ -329,6 +331,7 @@ def options_from(arguments: argparse.Namespace) -> SetOptions:
         points=arguments.points,
         noise_std=arguments.noise_std,
         renderer=choose_renderer(arguments.renderer) if arguments.view == "partial" else None,
+        variant=arguments.variant,
     )
 
 

@@ -155,12 +155,14 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--category", required=True, choices=category_names())
     parser.add_argument("--source", default="procedural", choices=tuple(SOURCES))
     parser.add_argument("--root", type=Path, help="folder of an external source's data set")
+    parser.add_argument("--variant", help="of the category's procedural designs")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("build/preview"), help="folder")
     arguments = parser.parse_args(argv)
-    spec = load_category(arguments.category)
-    path = arguments.out / f"{spec.name}-{arguments.source}.png"
+    variant = f"-{arguments.variant}" if arguments.variant else ""
+    path = arguments.out / f"{arguments.category}-{arguments.source}{variant}.png"
     try:
+        spec = load_category(arguments.category, arguments.variant)
         source = open_source(arguments.source, spec, arguments.root, arguments.seed)
         ids = source.instance_ids()[: 2 * COLUMNS]
         for line in left_out_lines(source.left_out()):

@@ -42,6 +42,7 @@ class SetOptions:
         points: Points per cloud.
         noise_std: Standard deviation of the depth noise, in units of the rest-state bounding-box diagonal.
         renderer: One of `render.partial_cloud.RENDERERS` for partial views, None for complete clouds.
+        variant: Of the category's procedural designs; None for the category itself.
     """
 
     category: str
@@ -59,6 +60,7 @@ class SetOptions:
     points: int
     noise_std: float
     renderer: str | None
+    variant: str | None = None
 
     def copies(self, split: str) -> int:
         """Stored samples per articulation state."""
@@ -140,7 +142,7 @@ def make_shard(task: ShardTask) -> ShardResult:
         OSError: if the shard cannot be written.
     """
     options, spec = task.options, load_category(task.options.category)
-    instance = _load_instance(options.category, options.source, options.root, options.seed, task.instance_id)
+    instance = _load_instance(options, task.instance_id)
     ranges = spec.sampled_ranges(instance)
     all_states = sample_states(ranges, options.states, _generator(task, "states"))
     make_samples = _partial_samples if options.view == "partial" else _complete_samples
@@ -220,17 +222,17 @@ def _stack(samples: list[dict[str, np.ndarray]], instance: ArticulatedObject, in
 
 
 @lru_cache(maxsize=1)
-def _load_instance(category: str, source: str, root: str | None, seed: int, instance_id: str) -> ArticulatedObject:
+def _load_instance(options: SetOptions, instance_id: str) -> ArticulatedObject:
     """The validated instance in its category's rest state; kept for the next shard of the same instance."""
-    spec = load_category(category)
-    instance = open_source(source, spec, None if root is None else Path(root), seed).load(instance_id)
+    spec, root = load_category(options.category, options.variant), None if options.root is None else Path(options.root)
+    instance = open_source(options.source, spec, root, options.seed).load(instance_id)
     return spec.to_rest(instance.validate())
 
 
 @lru_cache(maxsize=1)
 def _reachable_surface(options: SetOptions, split: str, instance_id: str) -> ReachableSurface:
     """The instance's pool of reachable points; kept for the next shard of the same instance."""
-    instance = _load_instance(options.category, options.source, options.root, options.seed, instance_id)
+    instance = _load_instance(options, instance_id)
     rng = generator_for(options.seed, split, instance_id, "surface")
     states = sample_states(load_category(options.category).sampled_ranges(instance), _REACH_STATES, rng)
     return ReachableSurface(instance, states, rng)
@@ -241,7 +243,7 @@ def _depth_sensor(options: SetOptions, instance_id: str) -> DepthSensor:
     """The sensor that looks at the instance; kept for the next shard of the same instance."""
     spec = load_category(options.category)
     return DepthSensor(
-        _load_instance(options.category, options.source, options.root, options.seed, instance_id),
+        _load_instance(options, instance_id),
         spec.view,
         renderer=options.renderer,
         protocol=options.protocol,

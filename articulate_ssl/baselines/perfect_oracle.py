@@ -68,4 +68,5 @@ def perfect_oracle(labels: dict[str, Tensor]) -> Prediction:
         canonical_axis=axis @ to_canonical[:, :3, :3].transpose(-1, -2),
         canonical_pivot=transform_points(to_canonical, pivot),
         reconstruction_error=points.new_zeros(clouds),
+        margin=points.new_ones(clouds),
     )

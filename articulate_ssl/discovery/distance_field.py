@@ -35,7 +35,7 @@ class DistanceFields(NamedTuple):
         return DistanceFields(torch.as_tensor(np.stack(fields)) * (2 * HALF_WIDTH / _CELLS))
 
     def at(self, index: int, points: Tensor) -> Tensor:
-        """Distances of points [..., 3] to one of the clouds, [...]; what is outside the cube is far from every cloud."""
+        """Distances of points [..., 3] to one of the clouds, [...]; outside the cube, every cloud is far."""
         outside = points.abs().amax(dim=-1) > HALF_WIDTH
         return self.values[index][_cells(points)].masked_fill(outside, HALF_WIDTH)
 

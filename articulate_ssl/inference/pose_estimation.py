@@ -11,11 +11,13 @@ Training takes the first two steps too; nothing here knows a loss or an optimise
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import roma
 import torch
 from torch import Tensor
 
@@ -30,6 +32,7 @@ from articulate_ssl.network.rigid_alignment import RigidAlignment
 from articulate_ssl.ops.chamfer import chamfer, hypothesis_distances
 from articulate_ssl.shape.observation import Observation
 
+_ANOTHER_WAY = math.radians(30)  # beyond, one of two hypotheses is wrong (`metrics.above_30_rate`)
 # Standard deviations, over the training clouds, by which the scale of a scan may differ from their mean.
 _SCALE_STARTS = (-1.5, -0.75, 0.0, 0.75, 1.5)
 
@@ -54,6 +57,19 @@ class InferenceOptions:
     rounds: int = 8
     coarse_scale: float = 0.05
     fine_scale: float = 0.02
+
+
+def margins(
+    error: Tensor,  # [B, C] of the hypotheses
+    base: Tensor,  # [B, C, 4, 4]
+    chosen: Tensor,  # [B]
+) -> Tensor:  # [B]
+    """`Prediction.margin` of chosen hypotheses: how much worse the best one is that is turned another way."""
+    rows = torch.arange(len(chosen), device=chosen.device)
+    rotation = base[..., :3, :3]
+    angle = roma.rotmat_geodesic_distance(rotation, rotation[rows, chosen, None].expand_as(rotation))
+    rival = error.masked_fill(angle < _ANOTHER_WAY, torch.inf).amin(dim=1)
+    return (1 - error[rows, chosen] / rival).clamp(0, 1)
 
 
 @dataclass(frozen=True)
@@ -183,10 +199,11 @@ class PoseEstimator:
             aligned, pose = self.align(points[:, :num_points])
             *_, last = self.iterate(aligned)
             if self.inference.refine if refine is None else refine:
-                chosen = self._refine(last, transform_points(invert_se3(pose), points))
+                chosen, margin = self._refine(last, transform_points(invert_se3(pose), points))
             else:
                 chosen = last.hypotheses.select(last.winner)
-            return self._prediction(chosen.at(pose[:, None] @ chosen.base, chosen.state), points)
+                margin = margins(last.distance, last.hypotheses.base, last.winner)
+            return self._prediction(chosen.at(pose[:, None] @ chosen.base, chosen.state), points, margin)
 
     def predict_scan(
         self,
@@ -216,8 +233,8 @@ class PoseEstimator:
         best = int((prediction.reconstruction_error / extent).argmin())
         return prediction[best : best + 1], center, scales[best], batch[best].cpu().numpy()
 
-    def _refine(self, last: Iteration, points: Tensor) -> Hypotheses:
-        """The best of the leading hypotheses after articulated registration of the predicted shape."""
+    def _refine(self, last: Iteration, points: Tensor) -> tuple[Hypotheses, Tensor]:
+        """The best of the leading hypotheses after articulated registration of the predicted shape, and its margin."""
         options, hypotheses = self.inference, last.hypotheses
         count = min(options.candidates, hypotheses.base.shape[1])
         candidates = hypotheses.select(last.leading(count))
@@ -225,9 +242,10 @@ class PoseEstimator:
         base, state, error = self.register(candidates, points, scales, options.rounds)
         best = self.observation.ranked(error, base[..., :3, :3]).argmin(dim=1)
         rows = torch.arange(len(points), device=points.device)
-        return candidates.select(best).at(base[rows, best][:, None], state[rows, best][:, None])
+        chosen = candidates.select(best).at(base[rows, best][:, None], state[rows, best][:, None])
+        return chosen, margins(error, base, best)
 
-    def _prediction(self, chosen: Hypotheses, points: Tensor) -> Prediction:
+    def _prediction(self, chosen: Hypotheses, points: Tensor, margin: Tensor) -> Prediction:
         """Package one hypothesis per cloud."""
         pose = chosen.object_pose()[:, 0]
         part_pose = pose.clone()
@@ -255,4 +273,5 @@ class PoseEstimator:
             canonical_axis=axis,
             canonical_pivot=pivot,
             reconstruction_error=chamfer(points, posed.flatten(1, 2), bidirectional=self.observation.bidirectional),
+            margin=margin,
         )

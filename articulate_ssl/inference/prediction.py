@@ -30,6 +30,8 @@ class Prediction:
         canonical_axis: [B, J, 3] the same axes in canonical object space.
         canonical_pivot: [B, J, 3] the same pivots in canonical object space.
         reconstruction_error: [B] distance between the cloud and its reconstruction (the loss's distance, L1 type).
+        margin: [B] in [0, 1], how much better this reconstructs the cloud than the best rival that is turned another
+            way: 1 - error / rival's error; 0 if a rival is as good, 1 if none was considered. No probability.
     """
 
     part_id: Tensor
@@ -47,6 +49,7 @@ class Prediction:
     canonical_axis: Tensor
     canonical_pivot: Tensor
     reconstruction_error: Tensor
+    margin: Tensor
 
     @property
     def num_parts(self) -> int:

@@ -18,7 +18,10 @@ from articulate_ssl.metrics.calibration import (
     match_joints,
     predicts_joints,
 )
+from articulate_ssl.metrics.confidence import report_confidence
 from articulate_ssl.metrics.functional import (
+    ABOVE_DEG,
+    FLIP_DEG,
     axis_angle_error,
     chamfer_l1,
     iou_matrix,
@@ -53,8 +56,6 @@ PER_CLOUD = ("chamfer_l1", "tree_accuracy", "root_accuracy", "legacy_axis_err_de
 AT_THE_END = ("r_err_sym_deg",)
 REST = ("points", "part_id", "part_center", "joint_axis", "joint_pivot")  # of `rest_clouds`
 ANY_PART = ("flip_rate", "above_30_rate")  # true of a cloud if of any part
-FLIP_DEG = 90.0
-ABOVE_DEG = 30.0  # a cabinet turned by 78 degrees is wrong, and no flip; chosen without a measurement
 
 
 def part_pose_errors(
@@ -186,7 +187,7 @@ class ArticulatedPoseMetrics(Metric):
         self.replicates = replicates
         self.seed = seed
         measured = [name for name in (*PER_PART, *PER_JOINT, *PER_CLOUD) if name not in AT_THE_END]
-        for name in ("instance", "relative_rotation", *(f"rest_{name}" for name in REST), *measured):
+        for name in ("instance", "relative_rotation", *(f"rest_{name}" for name in REST), "margin", *measured):
             self.add_state(name, default=[], dist_reduce_fx="cat")
 
     def update(self, prediction: Prediction, labels: dict[str, Tensor]) -> None:
@@ -206,6 +207,7 @@ class ArticulatedPoseMetrics(Metric):
         for name, values in rest_clouds(labels).items():
             getattr(self, f"rest_{name}").append(values)
         self.instance.append(labels["instance"].long())
+        self.margin.append(prediction.margin.double())
 
     def compute(self) -> dict:
         """Statistics of everything seen.
@@ -215,8 +217,9 @@ class ArticulatedPoseMetrics(Metric):
             the mean; None with fewer than two instances) of each cloud's average over its parts or joints, and the same
             three for every single part or joint in the lists `parts` or `joints`. `flip_rate` and `above_30_rate` have
             a cloud count if any part does. Values that do not exist (the pivot of a prismatic joint) are None. Beside
-            them `samples`, `failures` (0: no cloud is ever dropped), `instances`, and `symmetric_instances`, those of
-            them with a symmetry besides the identity (`metrics/symmetry.py`).
+            them `samples`, `failures` (0: no cloud is ever dropped), `instances`, `symmetric_instances`, those of
+            them with a symmetry besides the identity (`metrics/symmetry.py`), and `margin`, what `Prediction.margin` is
+            worth as a confidence (`metrics/confidence.py`).
 
         Raises:
             ValueError: if nothing was added.
@@ -237,7 +240,8 @@ class ArticulatedPoseMetrics(Metric):
             result[name] = self._summary(average, instance)
             single = "parts" if name in PER_PART else "joints"
             result[name][single] = [self._summary(column, instance) for column in values.unbind(1)]
-        return result | {"samples": len(instance), "failures": 0} | counts
+        confidence = report_confidence(dim_zero_cat(self.margin), dim_zero_cat(self.r_err_deg))
+        return result | {"samples": len(instance), "failures": 0} | counts | {"margin": confidence}
 
     def _modulo_symmetry(self, instance: Tensor) -> tuple[dict[str, Tensor], dict[str, int]]:
         """`AT_THE_END`, every one [S, K], and how many instances there are and are symmetric."""

@@ -11,7 +11,7 @@ import torch
 from scipy.stats import rankdata
 from torch import Tensor
 
-from articulate_ssl.metrics.articulated_pose import ABOVE_DEG, FLIP_DEG
+from articulate_ssl.metrics.functional import ABOVE_DEG, FLIP_DEG
 
 BINS = 10
 

@@ -18,6 +18,9 @@ from torch import Tensor
 PARALLEL_BELOW = math.radians(1.0)
 SKEW_ABOVE = math.radians(5.0)
 
+FLIP_DEG = 90.0
+ABOVE_DEG = 30.0  # a cabinet turned by 78 degrees is wrong, and no flip; chosen without a measurement
+
 
 def rotation_error(
     predicted: Tensor,  # [..., 3, 3]

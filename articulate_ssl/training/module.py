@@ -169,10 +169,11 @@ class ArticulatedPoseModule(LightningModule):
 
     @torch.no_grad()
     def _track(self, outcome: Outcome) -> None:
-        """Log the terms and the warning signs (design 3.5); follow confidences and joint states."""
+        """Log the terms and the warning signs (design 3.5); follow joint states, and a tree that is learnt."""
         terms, selected = outcome.terms, outcome.selected
-        weight = max(_CONFIDENCE_WEIGHT, 1 / (self.global_step + 1))
-        self.articulated.category.follow(selected.structure.confidence, weight)
+        if self.recipe.learns_tree:
+            weight = max(_CONFIDENCE_WEIGHT, 1 / (self.global_step + 1))
+            self.articulated.category.follow(selected.structure.confidence, weight)
         state = selected.state[:, 0]
         self.states.follow(state)
         occupancy = one_hot(terms.association.argmax(dim=-1), self.num_parts).float().mean(dim=(0, 1))

@@ -57,8 +57,12 @@ def open_source(name: str, spec: CategorySpec, root: Path | None, seed: int) -> 
         seed: Of the procedural designs; other sources ignore it.
 
     Raises:
-        ValueError: if the source is unknown, or `root` does not hold a data set of its kind.
+        ValueError: if the source is unknown, cannot make the variant, or `root` does not hold a data set of its kind.
     """
     if name not in SOURCES:
         raise ValueError(f"unknown source {name!r}; choose one of {', '.join(SOURCES)}")
+    if spec.variant is not None and name != "procedural":
+        raise ValueError(
+            f"variant {spec.variant!r} is one of procedural designs; source {name!r} has none, leave it out"
+        )
     return import_module(SOURCES[name]).open(spec, root, seed)

@@ -16,7 +16,7 @@ from render.ray_caster import RayCaster
 from render.sources import open_source
 
 RENDERERS = pytest.mark.parametrize("renderer", [DepthRenderer, RayCaster])
-CATEGORIES = ("laptop", "laptop_real", "oven", "safe", "washing_machine", "drawer", "eyeglasses")
+CATEGORIES = ("laptop", "laptop_real", "oven", "safe", "washing_machine", "drawer", "eyeglasses", "desk_lamp")
 
 
 def at_depth(depth: float) -> np.ndarray:  # [4, 4]

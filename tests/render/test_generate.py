@@ -108,10 +108,42 @@ def test_training_clouds_are_stored_once_unrotated_and_test_clouds_rotated(compl
         ("safe", []),
         ("washing_machine", ["--view", "partial"]),
         ("laptop_real", []),
+        ("desk_lamp", []),
+        ("desk_lamp", ["--view", "partial"]),
+        ("safe", ["--variant", "both_sides"]),
     ],
 )
 def test_generated_sets_pass_verification(tmp_path, category, options):
     assert verify_set(make(tmp_path, *options, train=1, category=category)) == []
+
+
+@pytest.mark.parametrize("options", [[], ["--view", "partial"]])
+def test_shards_of_a_serial_chain_name_every_joint_with_its_parent_and_carry_its_children_along(tmp_path, options):
+    shard = read_shard(make(tmp_path, *options, train=1, category="desk_lamp") / "train" / "shard-00000.npz")
+    samples = len(shard["scale"])
+    np.testing.assert_array_equal(shard["joint_parent"], np.broadcast_to([0, 1, 2], (samples, 3)))
+    np.testing.assert_array_equal(shard["joint_child"], np.broadcast_to([1, 2, 3], (samples, 3)))
+    axis, pivot = (shard[name].astype(float) for name in ("joint_axis", "joint_pivot"))
+    np.testing.assert_allclose(axis, np.broadcast_to(axis[:, :1], axis.shape), atol=1e-5)  # parallel in every state
+    arms = np.linalg.norm(np.diff(pivot, axis=1), axis=2) * shard["scale"][:, None]
+    np.testing.assert_allclose(arms, np.broadcast_to(arms[0], arms.shape), rtol=1e-4)  # links keep their lengths
+    # The head has turned by the sum of all three states.
+    rotation = shard["part_pose"][:, :, :3, :3].astype(float)
+    turned = np.einsum("sba,sbc->sac", rotation[:, 0], rotation[:, 3])
+    difference = np.einsum("ba,sbc->sac", turned[0], turned)
+    angle = np.arccos(np.clip((np.trace(difference, axis1=1, axis2=2) - 1) / 2, -1, 1))
+    states = shard["joint_state"].astype(float).sum(1)
+    np.testing.assert_allclose(angle, np.abs(states - states[0]), atol=2e-3)
+
+
+def test_a_variant_is_recorded_and_not_mixed_with_others(tmp_path, capsys):
+    folder = make(tmp_path, "--variant", "both_sides", category="safe")
+    assert Manifest.load(folder).options["variant"] == "both_sides"
+    counts = ["--train-instances", "2", "--test-instances", "1"]
+    assert main(["--category", "safe", "--out", str(tmp_path), "--workers", "1", *counts, *SMALL]) == 2
+    assert "variant 'both_sides', now None" in capsys.readouterr().err
+    assert main(["--category", "oven", "--out", str(tmp_path), "--variant", "both_sides"]) == 2
+    assert "'oven' has no variant 'both_sides'" in capsys.readouterr().err
 
 
 def test_moving_a_part_about_its_joint_lands_on_the_cloud_of_another_state(complete_set):

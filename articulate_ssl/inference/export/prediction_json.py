@@ -6,7 +6,8 @@ Convention of `prediction.json` (schema 1):
     `parts[k].assembly` is the translation from the canonical space of part k to the canonical object space. A joint's
     `axis` and `pivot` live in the frame of the scan, `canonical_axis` and `canonical_pivot` in the canonical object
     space; `state` and `limits` are relative to the canonical object shape. `reconstruction_error` and
-    `kinematic_error` are lengths. (scan - center) / scale is what the network saw.
+    `kinematic_error` are lengths. `margin` is how much better, from 0 to 1, the prediction fits than the best rival
+    that is turned another way; it is no probability. (scan - center) / scale is what the network saw.
 """
 
 from __future__ import annotations
@@ -49,6 +50,7 @@ def describe(result: ScanResult) -> dict:
         "joints": _describe_joints(prediction, result.limits),
         "reconstruction_error": float(prediction.reconstruction_error[0]),
         "kinematic_error": kinematic_error(prediction),
+        "margin": float(prediction.margin[0]),
         "category": result.category,
         "checkpoint": result.checkpoint,
         "center": list(map(float, result.center)),

@@ -55,6 +55,8 @@ class Recipe(ABC):
         self.estimator, self.objective = estimator, objective
         self.schedule, self.discovery = schedule, discovery
 
+    learns_tree = True  # or it was found before, and stays
+
     @property
     def ready(self) -> bool:
         """Whether the networks have begun to learn, so that it makes sense to validate them."""

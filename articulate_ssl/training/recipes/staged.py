@@ -50,6 +50,10 @@ class HandOver:
 class TrainingRecipe(Recipe):
     """See above. The learning rate falls along a cosine."""
 
+    # L_reg pulls siblings that lie side by side together as gladly as part and parent: of four parts, it made another
+    # tree of the one that discovery had found, whose joints nothing had trained.
+    learns_tree = False
+
     def __init__(self, *args) -> None:
         super().__init__(*args)
         load_proposals(self.discovery.proposals)  # a misspelt name is to be told before anything runs

@@ -1,6 +1,7 @@
-"""Generated instances of all seven categories: no download, and any number of them.
+"""Generated instances of all categories: no download, and any number of them.
 
-An instance is a function of (seed, id) only, so every machine and every worker makes the same meshes.
+An instance is a function of seed, id and the category's variant only, so every machine and every worker makes the same
+meshes.
 """
 
 from __future__ import annotations
@@ -12,15 +13,25 @@ from render.articulated_object import ArticulatedObject
 from render.category import CategorySpec
 from render.seeds import generator_for
 from render.sources import Source
-from render.sources.procedural import drawer, eyeglasses, laptop, oven, safe, washing_machine
+from render.sources.procedural import (
+    desk_lamp,
+    drawer,
+    eyeglasses,
+    laptop,
+    laptop_parameters,
+    oven,
+    safe,
+    washing_machine,
+)
 from render.sources.procedural.shapes import to_trimesh
 
 # How to draw an instance's parameters, and how to build its solids from them.
 GENERATORS = {
+    "desk_lamp": (desk_lamp.sample, desk_lamp.build),
     "drawer": (drawer.sample, drawer.build),
     "eyeglasses": (eyeglasses.sample, eyeglasses.build),
-    "laptop": (laptop.sample_laptop, laptop.build),
-    "laptop_real": (laptop.sample_laptop_real, laptop.build),
+    "laptop": (laptop_parameters.sample_laptop, laptop.build),
+    "laptop_real": (laptop_parameters.sample_laptop_real, laptop.build),
     "oven": (oven.sample, oven.build),
     "safe": (safe.sample, safe.build),
     "washing_machine": (washing_machine.sample, washing_machine.build),
@@ -49,7 +60,7 @@ class ProceduralSource(Source):
             known = f"{self.spec.name}-0000 to {self.spec.name}-{NUM_INSTANCES - 1}"
             raise ValueError(f"no procedural instance {instance_id!r} of {self.spec.name}; there are {known}")
         sample, build = GENERATORS[self.spec.name]
-        design = build(sample(generator_for(self.seed, "design", instance_id)))
+        design = build(sample(generator_for(self.seed, "design", instance_id), **self.spec.design_options))
         meshes = tuple(to_trimesh(solid) for solid in design.parts.values())
         return ArticulatedObject(instance_id, self.spec.name, tuple(design.parts), meshes, design.joints).validate()
 

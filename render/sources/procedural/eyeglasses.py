@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from manifold3d import CrossSection, Manifold
 
-from render.sources.procedural.design import Design, hinge
+from render.sources.procedural.design import Design, from_quantiles, hinge
 from render.sources.procedural.shapes import box, cylinder, extrude, loft, subtract, union
 
+_STRAIGHT = 1e3  # metres: radius of a front that is not curved
+_FLATTEST_END = 0.0018  # metres; shorter end pieces would leave nothing between rim and barrels
 _CLEARANCE = 2e-4  # between the moving pieces of a hinge
 
 
@@ -61,12 +63,13 @@ def sample(rng: np.random.Generator) -> EyeglassesParameters:
     """Wire and acetate frames of six shapes."""
     shape = str(rng.choice(list(_FRAME_SHAPES)))
     aspect, exponent, taper, lift, skew = (rng.uniform(*interval) for interval in _FRAME_SHAPES[shape])
-    wire = rng.random() < (0.8 if shape == "aviator" else 0.4)
+    wire = rng.random() < (0.7 if shape == "aviator" else 0.3)
     lens_width = rng.uniform(0.046, 0.058) if shape != "round" else rng.uniform(0.042, 0.050)
     lens_height = lens_width * aspect
-    lenses = bool(rng.random() < 0.7)
+    lenses = bool(rng.random() < 0.6)
+    flat = rng.random() < 0.15  # as drawn from a photograph: a frame that is a plate, with the hinges right behind it
     rim_width = rng.uniform(0.0014, 0.0022) if wire else rng.uniform(0.003, 0.006)
-    leg_height = rng.uniform(0.0028, 0.0045) if wire else rng.uniform(0.006, 0.014)
+    leg_height = rng.uniform(0.0028, 0.007) if wire else rng.uniform(0.007, 0.019)
     return EyeglassesParameters(
         lens_width=lens_width,
         lens_height=lens_height,
@@ -80,20 +83,20 @@ def sample(rng: np.random.Generator) -> EyeglassesParameters:
         bridge_radius=rng.uniform(0.0011, 0.0016) if wire else rng.uniform(0.002, 0.003),
         double_bridge=bool(shape == "aviator" and rng.random() < 0.6),
         rim_width=rim_width,
-        rim_depth=rng.uniform(0.0018, 0.0028) if wire else rng.uniform(0.003, 0.0045),
+        rim_depth=rng.uniform(0.0018, 0.0028) if wire or flat else rng.uniform(0.003, 0.0060),
         lenses=lenses,
         lower_rim=not (lenses and rng.random() < 0.15),
-        nose_pads=bool(wire or rng.random() < 0.2),
-        curve_radius=rng.uniform(0.20, 0.40),
+        nose_pads=bool(not flat and rng.random() < (0.9 if wire else 0.2)),
+        curve_radius=_STRAIGHT if flat else rng.uniform(0.15, 0.60),
         hinge_height=rng.uniform(0.45, 0.7) if shape != "round" else rng.uniform(0.0, 0.45),
         end_width=rng.uniform(0.004, 0.009),
-        end_depth=rng.uniform(0.005, 0.010),
-        leg_thickness=rng.uniform(0.0016, 0.0024) if wire else rng.uniform(0.0028, 0.0045),
+        end_depth=_FLATTEST_END if flat else from_quantiles(rng, _FLATTEST_END, 0.004, 0.007, 0.010, 0.013),
+        leg_thickness=rng.uniform(0.0016, 0.0030) if wire else rng.uniform(0.0028, 0.0060),
         leg_height=leg_height,
-        leg_tip_height=rng.uniform(0.004, 0.007) if wire else leg_height * rng.uniform(0.5, 0.8),
-        leg_length=rng.uniform(0.130, 0.150),
+        leg_tip_height=rng.uniform(0.004, 0.009) if wire else leg_height * rng.uniform(0.5, 1.0),
+        leg_length=rng.uniform(0.120, 0.155),
         hook_share=rng.uniform(0.24, 0.36),
-        hook_angle=np.deg2rad(rng.uniform(22.0, 55.0)),
+        hook_angle=np.deg2rad(rng.uniform(8.0, 55.0)),
         leg_splay=rng.uniform(-0.006, 0.004),
     )
 

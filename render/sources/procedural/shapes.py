@@ -113,6 +113,11 @@ def subtract(solid: Manifold, tools: Sequence[Manifold]) -> Manifold:
     return _evaluated(Manifold.batch_boolean([solid, *tools], OpType.Subtract))
 
 
+def intersect(solid: Manifold, other: Manifold) -> Manifold:
+    """What two solids share."""
+    return _evaluated(solid ^ other)
+
+
 def to_trimesh(solid: Manifold) -> trimesh.Trimesh:
     """Watertight triangle mesh of a solid."""
     mesh = solid.to_mesh64()
@@ -123,7 +128,7 @@ def _evaluated(solid: Manifold) -> Manifold:
     """The solid, computed now.
 
     Left to itself, manifold3d flattens nested operations that nothing else refers to, so that the triangles depend on
-    whether a debugger, a profiler or a traceback happens to hold on to an operand. Hence no `+` and `-` on solids.
+    whether a debugger, a profiler or a traceback happens to hold on to an operand. Hence no `+`, `-` and `^` on solids.
     """
     solid.num_tri()
     return solid

@@ -1,4 +1,4 @@
-"""Front-loading washing machines: a body with drum, panel and knob, and a round side-hinged door with a porthole."""
+"""Front-loading washing machines: a body with drum, panel and knob, and a side-hinged door with a porthole."""
 
 from __future__ import annotations
 
@@ -28,7 +28,10 @@ _OPENING_DEPTH = 0.05  # from the front to the drum
 
 @dataclass(frozen=True)
 class WashingMachineParameters:
-    """Sizes in metres. Heights are above the lower face of the body, the bowl depth is behind its front."""
+    """Sizes in metres. Heights are above the lower face of the body, the bowl depth is behind its front.
+
+    A door is round, or a rounded square about its porthole if `square_door`.
+    """
 
     width: float
     height: float
@@ -39,6 +42,7 @@ class WashingMachineParameters:
     door_height: float
     door_radius: float
     door_thickness: float
+    square_door: bool
     window_radius: float
     bowl_depth: float
     dish_depth: float
@@ -57,25 +61,27 @@ class WashingMachineParameters:
 
 
 def sample(rng: np.random.Generator) -> WashingMachineParameters:
-    """Full-size and slim machines."""
-    width, height = rng.uniform(0.54, 0.70), rng.uniform(0.78, 0.98)
-    panel_height = rng.uniform(0.10, 0.16)
-    door_radius = rng.uniform(0.29, 0.38) * width
+    """Full-size, slim and table-top machines."""
+    width = rng.uniform(0.46, 0.74)
+    height = width * rng.uniform(1.15, 1.75)
+    panel_height = rng.uniform(0.09, 0.17)
+    door_radius = rng.uniform(0.22, 0.39) * width
     free = height - panel_height
-    window_radius = door_radius * rng.uniform(0.66, 0.78)
+    window_radius = door_radius * rng.uniform(0.55, 0.80)
     drawer_left = rng.random() < 0.75
     return WashingMachineParameters(
         width=width,
         height=height,
-        depth=rng.uniform(0.42, 0.66),
+        depth=rng.uniform(0.38, 0.80),
         corner=rng.uniform(0.003, 0.03),
         panel_height=panel_height,
         panel_slope=rng.uniform(0.15, 0.35) if rng.random() < 0.35 else 0.0,
-        door_height=free * rng.uniform(0.50, 0.56) if free > 2.4 * door_radius else free / 2,
+        door_height=free * rng.uniform(0.46, 0.60) if free > 2.4 * door_radius else free / 2,
         door_radius=door_radius,
-        door_thickness=rng.uniform(0.03, 0.055),
+        door_thickness=rng.uniform(0.022, 0.065),
+        square_door=bool(rng.random() < 0.2),
         window_radius=window_radius,
-        bowl_depth=rng.uniform(0.02, 0.09),
+        bowl_depth=rng.uniform(0.0, 0.12),
         dish_depth=rng.uniform(0.004, 0.012),
         grip_lug=bool(rng.random() < 0.5),
         drum_radius=min(rng.uniform(1.15, 1.4) * window_radius, width / 2 - 0.03),
@@ -106,7 +112,7 @@ def _body(p: WashingMachineParameters, pivot: np.ndarray) -> Manifold:
     center = (0.0, p.door_height, 0.0)
     opening = p.window_radius + 0.008
     cuts = [
-        cylinder(center, "z", front - p.dish_depth, front + 1e-3, p.door_radius + 0.012, segments=_SEGMENTS),
+        _door_outline(p, p.door_radius + 0.012, front - p.dish_depth, front + 1e-3),
         cylinder(center, "z", front - 2 * _OPENING_DEPTH, front, opening, segments=_SEGMENTS),
         cylinder(center, "z", -front + 0.06, front - _OPENING_DEPTH, p.drum_radius, segments=_SEGMENTS),
         *_grooves(p, front),
@@ -118,6 +124,14 @@ def _body(p: WashingMachineParameters, pivot: np.ndarray) -> Manifold:
         wedge = polygon([(front - run, p.height + 1e-3), (front + 1e-3, low), (front + 1e-3, p.height + 1e-3)])
         body = subtract(body, [extrude(wedge, "x", -p.width, p.width)])
     return union([body, *_panel(p, front), *_lifters(p, front), *_brackets(p, pivot, front), *_stand(p, front)])
+
+
+def _door_outline(p: WashingMachineParameters, radius: float, low: float, high: float) -> Manifold:
+    """Disc or rounded square of the door's shape, `radius` from its middle to its sides."""
+    if not p.square_door:
+        return cylinder((0.0, p.door_height, 0.0), "z", low, high, radius, segments=_SEGMENTS)
+    corner = (-radius, p.door_height - radius, low), (radius, p.door_height + radius, high)
+    return rounded_box(*corner, "z", 0.3 * radius)
 
 
 def _grooves(p: WashingMachineParameters, front: float) -> list[Manifold]:
@@ -192,6 +206,10 @@ def _door(p: WashingMachineParameters, pivot: np.ndarray) -> Manifold:
     outside = [*zip(r, z, strict=True), (window, t), (p.door_radius - bevel, t), (p.door_radius, t - bevel)]
     inside = [(p.door_radius, gap), (window, gap), *zip(r[-2::-1], z[-2::-1] - glass, strict=True)]
     porthole = revolve([*outside, *inside], "z", _SEGMENTS).translate((0, p.door_height, front))
+    if p.square_door:
+        rim = _door_outline(p, p.door_radius, front + gap, front + 0.7 * t)
+        hole = cylinder((0.0, p.door_height, 0.0), "z", front - 1.0, front + 1.0, 0.99 * window, segments=_SEGMENTS)
+        porthole = union([porthole, subtract(rim, [hole])])
     x, y, z0 = pivot
     lug = box((x, y - 0.03, z0 - 0.006), (-p.door_radius + 0.02, y + 0.03, z0 + 0.006))
     knuckle = cylinder(pivot, "y", y - 0.03, y + 0.03, _KNUCKLE_RADIUS, segments=16)

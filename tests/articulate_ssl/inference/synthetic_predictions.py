@@ -49,6 +49,7 @@ def chain_of_boxes(boxes, joints, states, num_points=512, shape_points=256, seed
         canonical_axis=axis[None],
         canonical_pivot=pivot[None],
         reconstruction_error=torch.tensor([0.012]),
+        margin=torch.tensor([0.4]),
     )
     unknown = dict.fromkeys(("part_id", "part_probability", "joint_axis", "joint_pivot"), torch.zeros(1))
     unknown["part_pose"] = torch.zeros(1, len(boxes), 4, 4)

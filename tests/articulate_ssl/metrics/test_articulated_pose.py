@@ -243,7 +243,16 @@ def test_every_quantity_of_the_contract_is_there():
         "seg_miou",
         "chamfer_l1",
     } <= set(result)
-    assert set(result) == {*PER_PART, *PER_JOINT, *PER_CLOUD, "samples", "failures", "instances", "symmetric_instances"}
+    assert set(result) == {
+        *PER_PART,
+        *PER_JOINT,
+        *PER_CLOUD,
+        "samples",
+        "failures",
+        "instances",
+        "symmetric_instances",
+        "margin",
+    }
     for name in (*PER_PART, *PER_JOINT, *PER_CLOUD):
         assert {"mean", "median", "ci95"} <= set(result[name])
     assert [len(result[name]["parts"]) for name in PER_PART] == [3] * len(PER_PART)

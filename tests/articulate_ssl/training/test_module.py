@@ -11,8 +11,9 @@ from tiny import POINTS, fit, quiet_trainer, tiny_data, tiny_module
 
 from articulate_ssl.inference.checkpoint_file import CheckpointError
 from articulate_ssl.inference.prediction import Prediction
-from articulate_ssl.losses.objective import ObjectiveOptions
+from articulate_ssl.losses.objective import ObjectiveOptions, paper_terms
 from articulate_ssl.training.checkpoint import load_module
+from articulate_ssl.training.recipes.recipe import Outcome
 from datamodules.articulated_dataset import LABEL_ARRAYS, split_labels
 from datamodules.shards import read_shard, write_shard
 
@@ -289,3 +290,18 @@ def test_predicting_a_scan_of_any_unit_and_origin(trained):
     np.testing.assert_allclose(far_center, 1000 * center + [5e3, 0, -2e3])
     assert far_scale == pytest.approx(1000 * scale)
     _assert_same(replace(near, part_id=far.part_id), far, rtol=1e-2, atol=1e-2)
+
+
+@pytest.mark.parametrize(("recipe", "stays"), [("staged", True), ("paper", False)])
+def test_the_tree_that_discovery_found_stays(recipe, stays):
+    """Whatever adjacency is predicted later."""
+    module = tiny_module(recipe=recipe, num_parts=4)
+    category = module.articulated.category
+    before = category.mean_confidence.clone()
+    confidence = torch.full((2, 6), 5.0)
+    structure = replace(module.articulated(_clouds()).structure, confidence=confidence)
+    hypotheses = module.articulated(_clouds()).select(torch.zeros(3, dtype=torch.long))
+    terms = paper_terms(hypotheses, _clouds(), ObjectiveOptions())
+    module.log_dict = lambda *args, **kwargs: None
+    module._track(Outcome(terms.loss, terms, replace(hypotheses, structure=structure)))
+    assert torch.equal(category.mean_confidence, before) == stays

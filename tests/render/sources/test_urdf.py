@@ -64,6 +64,28 @@ def test_laptop_closed_at_its_upper_limit():
     np.testing.assert_allclose(load_category("laptop").sampled_ranges(laptop), [(np.deg2rad(9), 1.57)])
 
 
+def test_a_serial_chain_comes_back_from_a_urdf(tmp_path):
+    """A procedural lamp, written with every link in its joint's frame and read as one of its category."""
+    lamp = open_source("procedural", load_category("desk_lamp"), None, 3).load("desk_lamp-0001")
+    pivots = np.concatenate([np.zeros((1, 3)), [joint.pivot for joint in lamp.joints]])
+    links = ["stand", "lower rod", "upper rod", "head of the lamp"]
+    body = []
+    for name, mesh, pivot in zip(links, lamp.meshes, pivots, strict=True):
+        write_obj(tmp_path / f"{name}.obj", box(*(mesh.bounds - pivot)), Z_UP_TO_Y_UP.T)
+        body.append(f'<link name="{name}"><visual><geometry><mesh filename="{name}.obj"/></geometry></visual></link>')
+    for joint in lamp.joints:
+        xyz = Z_UP_TO_Y_UP.T @ (pivots[joint.child] - pivots[joint.parent])
+        extra = f'<origin xyz="{" ".join(map(repr, xyz.tolist()))}"/>'
+        limit = f'<limit lower="0" upper="{joint.upper!r}"/>'
+        parts = {"axis": '<axis xyz="1 0 0"/>', "limit": limit, "extra": extra}
+        body.append(urdf_joint(joint.name, links[joint.parent], links[joint.child], **parts))
+    write_urdf(tmp_path / "lamp.urdf", "\n".join(body))
+    found = load(tmp_path, "desk_lamp")
+    assert [(j.parent, j.child) for j in found.joints] == [(0, 1), (1, 2), (2, 3)]
+    for states in ([0.0, 0.0, 0.0], [0.3, 1.2, 0.5]):
+        np.testing.assert_allclose(found.part_motion(states), lamp.part_motion(np.array(states)), atol=1e-9)
+
+
 @pytest.mark.parametrize("category", ["safe", "oven", "washing_machine"])
 def test_microwave_opens_to_the_front(category):
     microwave = load(DATA / "microwave", category)

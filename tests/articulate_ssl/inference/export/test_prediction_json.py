@@ -44,6 +44,7 @@ def test_the_users_unit_and_origin_give_the_same_object_in_his_frame(tmp_path, m
         np.testing.assert_allclose(b["canonical_pivot"], np.array(a["canonical_pivot"]) * 1000, atol=1e-9)
     assert large["reconstruction_error"] == pytest.approx(1000 * small["reconstruction_error"])
     assert small["kinematic_error"] < 1e-6
+    assert small["margin"] == large["margin"] == pytest.approx(0.4)
 
 
 def test_the_tree_is_the_predicted_one(tmp_path):
