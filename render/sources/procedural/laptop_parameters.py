@@ -173,7 +173,7 @@ def sample_laptop(rng: np.random.Generator) -> LaptopParameters:
     lid = min(from_quantiles(rng, *_LID_TO_BASE), _THICKEST_LID / share)
     shape = _draw_build(rng, lid, from_quantiles(rng, *_HINGE_HEIGHT), walls=rng.random() < 0.2)
     height = share * diagonal / np.sqrt(1 - min(0.5, (share * shape.closed) ** 2))
-    return _sample(rng, width, depth, float(height), shape, open_shells=0.35)
+    return _sample(rng, width, depth, float(height), shape, open_shells=0.2)
 
 
 # Width, depth and closed height of common product classes, metres: 11", 13" and 14" ultrabooks, 14" and 15" business
@@ -299,7 +299,7 @@ def _draw_opening(rng: np.random.Generator, shape: _Build, shelf: bool) -> float
 def _draw_relief(rng: np.random.Generator, width: float, slab: float, lid: float, open_shells: float) -> Relief:
     """Relief no deeper than the plates bear."""
     bezel = rng.uniform(0.004, 0.012) if rng.random() < 0.5 else rng.uniform(0.012, 0.035)
-    keys = rng.random() < 0.84
+    keys = rng.random() < 0.94
     hollow_base = rng.random() < open_shells and slab > _THINNEST_SHELL
     keyboard_width = rng.uniform(0.74, 0.95)
     logo = "hollow" if rng.random() < open_shells else str(rng.choice(["none", "bump", "recess"], p=[0.5, 0.3, 0.2]))
@@ -314,7 +314,7 @@ def _draw_relief(rng: np.random.Generator, width: float, slab: float, lid: float
         logo_size=rng.uniform(0.05, 0.3),
         back_ribs=ribs,
         sunk_deck=min(rng.uniform(0.0005, 0.002), 0.12 * slab) if rng.random() < 0.2 else 0.0,
-        well=min(from_quantiles(rng, 0.0004, 0.001, 0.0025, 0.005), 0.3 * slab),
+        well=min(from_quantiles(rng, 0.001, 0.0018, 0.003, 0.005), 0.3 * slab),
         key_drop=rng.choice([0.1, 0.3, 0.6]),
         key_rows=int(rng.integers(4, 7)) if keys else 0,
         keys_per_row=int(rng.integers(10, 16)),
