@@ -53,10 +53,6 @@ class RegisteredShape:
         start = None if self.axes is None else self.log_stretch[rows]
         return InstanceFit(self.shape, self.base[rows], self.state[rows], generator, self.axes, start)
 
-    def part_pose(self) -> Tensor:
-        """[n, K, 4, 4] canonical object space -> cloud."""
-        return self.shape.joints.part_pose(self.base, self.state)
-
     def limits(self) -> Tensor:
         """[J, 2] between which joint states lie, as far as the clouds show."""
         limits = torch.quantile(self.state, torch.tensor(_LIMIT_QUANTILES).to(self.state), dim=0)
