@@ -22,7 +22,8 @@ class _Stage(NamedTuple):
     survivors: int
 
 
-# As accurate on development laptops as all starts on all points, at a third of the time (docs/experiments.md, step 4).
+# With other stages, halving was as accurate on development laptops as all starts on all points, at a third of the time
+# (docs/experiments.md, step 4).
 _HALVING = (
     _Stage(96, (0.14, 0.08), 3, 24),
     _Stage(128, (0.08, 0.04), 4, 12),

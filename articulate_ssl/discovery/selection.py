@@ -11,8 +11,7 @@ from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.discovery.registered_shape import trimmed_mean
 from articulate_ssl.geometry.screw import REVOLUTE
 
-# A wrong split is rarely among the best eight after a short descent, or the best three after a longer one; what each
-# costs grows with the descent (chosen by hand, docs/experiments.md).
+# Chosen by hand, not measured: the longer the descent, the fewer fits it can be paid for.
 _AFTER_SHORT_DESCENT, _AFTER_MEDIUM_DESCENT = 8, 3
 _STILL = 0.01  # in normalised units: what moves less is not a part
 

@@ -24,7 +24,7 @@ from articulate_ssl.losses.objective import PoseTarget, staged_terms
 from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.training.recipes.recipe import Outcome, Recipe
 
-# Registration that teaches: starts from the winner, so it may begin finer and end sooner than at test time.
+# Registration that teaches, in every step: shorter than at test time. Chosen, not measured.
 _SCALES, _ROUNDS = (0.04, 0.02), 4
 
 
