@@ -19,9 +19,9 @@ from articulate_ssl.cli import BAD_INPUT
 from articulate_ssl.geometry.orientation_range import OrientationRange
 from articulate_ssl.inference.checkpoint_file import CheckpointError
 from articulate_ssl.inference.export.folder import write_prediction
-from articulate_ssl.inference.export.scan_result import in_scan_frame
 from articulate_ssl.inference.point_cloud_io import PointCloudError, load_point_cloud
 from articulate_ssl.inference.prediction import Prediction
+from articulate_ssl.inference.scan_prediction import in_scan_frame
 
 
 class CloudPredictor(Protocol):
@@ -92,9 +92,9 @@ def _predict(args: argparse.Namespace, out: Path) -> tuple[CloudPredictor, list[
     module: CloudPredictor = load_module(args.ckpt).to(args.device).eval()
     prediction, center, scale, points = module.predict_cloud(cloud, refine=args.refine)
     result = in_scan_frame(
-        out, prediction, points, center, scale, cloud, module.state_range, module.category, str(args.ckpt)
+        prediction, points, center, scale, cloud, module.state_range, module.category, str(args.ckpt)
     )
-    return module, write_prediction(result)
+    return module, write_prediction(result, out)
 
 
 def _print_summary(out: Path, files: list[Path], orientation: OrientationRange) -> None:

@@ -1,4 +1,5 @@
-"""What a prediction leaves on disk: one file for each thing that is written, each with `write(result)`.
+"""What a prediction leaves on disk: one file for each thing that is written, each with `write(result, folder)`.
 
-To write something else, add a file with `write(result: ScanResult) -> list[Path]` and name it in `folder.EXPORTERS`.
+To write something else, add a file with `write(result: ScanPrediction, folder: Path) -> list[Path]` and name it in
+`folder.EXPORTERS`.
 """

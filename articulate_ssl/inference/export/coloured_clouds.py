@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from articulate_ssl.inference.articulation import posed_parts
-from articulate_ssl.inference.export.scan_result import ScanResult
 from articulate_ssl.inference.pictures.part_colour import part_colour
 from articulate_ssl.inference.point_cloud_io import save_coloured_ply
+from articulate_ssl.inference.scan_prediction import ScanPrediction
 
 
-def write(result: ScanResult) -> list[Path]:
+def write(result: ScanPrediction, folder: Path) -> list[Path]:
     """Write `parts.ply`, the whole scan, and `reconstruction.ply`, the posed part shapes; return the two."""
-    files = [result.folder / "parts.ply", result.folder / "reconstruction.ply"]
+    files = [folder / "parts.ply", folder / "reconstruction.ply"]
     save_coloured_ply(files[0], result.cloud, part_colour(result.part_id))
     shapes = posed_parts(result.prediction)[0]
     colours = part_colour(np.arange(result.prediction.num_parts))

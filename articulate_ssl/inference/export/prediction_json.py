@@ -20,24 +20,24 @@ import numpy as np
 from torch import Tensor
 
 from articulate_ssl.inference.articulation import articulate, posed_parts
-from articulate_ssl.inference.export.scan_result import JOINT_TYPE_NAMES, ScanResult
 from articulate_ssl.inference.pictures.part_colour import part_colour
 from articulate_ssl.inference.prediction import Prediction
+from articulate_ssl.inference.scan_prediction import JOINT_TYPE_NAMES, ScanPrediction
 from datamodules.atomic import atomic_write
 
 SCHEMA_VERSION = 1
 
 
-def write(result: ScanResult) -> list[Path]:
+def write(result: ScanPrediction, folder: Path) -> list[Path]:
     """Write `prediction.json`; return it."""
-    file = result.folder / "prediction.json"
+    file = folder / "prediction.json"
     content = _compact_json(describe(result)).encode()
     with atomic_write(file) as opened:
         opened.write(content)
     return [file]
 
 
-def describe(result: ScanResult) -> dict:
+def describe(result: ScanPrediction) -> dict:
     """The content of `prediction.json` (see the module's convention)."""
     prediction = result.prediction
     parents = _parents(prediction)

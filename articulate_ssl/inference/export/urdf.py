@@ -10,15 +10,15 @@ from lxml import etree
 
 from articulate_ssl.inference.articulation import canonical_object
 from articulate_ssl.inference.export.part_mesh import part_mesh
-from articulate_ssl.inference.export.scan_result import JOINT_TYPE_NAMES, ScanResult
 from articulate_ssl.inference.pictures.part_colour import part_colour
 from articulate_ssl.inference.prediction import Prediction
+from articulate_ssl.inference.scan_prediction import JOINT_TYPE_NAMES, ScanPrediction
 from datamodules.atomic import atomic_write
 
 MESH_FOLDER = "meshes"
 
 
-def write(result: ScanResult) -> list[Path]:
+def write(result: ScanPrediction, folder: Path) -> list[Path]:
     """Write `meshes/part_<k>.stl` and `object.urdf`: the canonical object, articulated by the predicted joints.
 
     Convention:
@@ -33,14 +33,14 @@ def write(result: ScanResult) -> list[Path]:
     prediction = result.prediction
     origin = np.zeros((prediction.num_parts, 3))
     origin[prediction.joint_child[0].tolist()] = prediction.canonical_pivot[0].numpy()
-    meshes = _write_meshes(result.folder / MESH_FOLDER, canonical_object(prediction)[0].numpy())
+    meshes = _write_meshes(folder / MESH_FOLDER, canonical_object(prediction)[0].numpy())
 
     robot = etree.Element("robot", name=result.category)
     for k, mesh in enumerate(meshes):
         _add_link(robot, k, mesh, origin[k])
     for j, (lower, upper) in enumerate(result.limits.tolist()):
         _add_joint(robot, prediction, j, origin, lower, upper)
-    file = result.folder / "object.urdf"
+    file = folder / "object.urdf"
     with atomic_write(file) as opened:
         opened.write(etree.tostring(robot, pretty_print=True, xml_declaration=True, encoding="utf-8"))
     return [*meshes, file]

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import synthetic_predictions as synthetic
 import trimesh
-from scan_results import CENTER, OBJECTS, SCALE, result_of
+from scan_predictions import CENTER, OBJECTS, SCALE, result_of
 
 from articulate_ssl.inference.articulation import posed_parts
 from articulate_ssl.inference.export import coloured_clouds
@@ -16,8 +16,8 @@ def test_every_point_of_the_scan_is_coloured_by_its_part(tmp_path):
     seen = points.numpy()[::4]
     prediction = Prediction(**{**vars(prediction), "part_id": prediction.part_id[:, ::4]})
     cloud = points.numpy() * SCALE + CENTER
-    result = result_of(tmp_path, synthetic.laptop, prediction=prediction, points=seen, cloud=cloud)
-    coloured_clouds.write(result)
+    result = result_of(synthetic.laptop, prediction=prediction, points=seen, cloud=cloud)
+    coloured_clouds.write(result, tmp_path)
     coloured = trimesh.load(tmp_path / "parts.ply")
     np.testing.assert_allclose(coloured.vertices, cloud, atol=1e-5)
     true_parts = synthetic.laptop()[0].part_id[0].numpy()
@@ -27,8 +27,8 @@ def test_every_point_of_the_scan_is_coloured_by_its_part(tmp_path):
 
 @pytest.mark.parametrize("make", OBJECTS)
 def test_the_reconstruction_is_the_posed_parts_each_in_its_colour(tmp_path, make):
-    result = result_of(tmp_path, make)
-    coloured_clouds.write(result)
+    result = result_of(make)
+    coloured_clouds.write(result, tmp_path)
     coloured = trimesh.load(tmp_path / "reconstruction.ply")
     expected = posed_parts(result.prediction)[0]
     np.testing.assert_allclose(coloured.vertices, expected.reshape(-1, 3), atol=1e-5)

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import synthetic_predictions as synthetic
 import torch
-from scan_results import CENTER, OBJECTS, SCALE, result_of
+from scan_predictions import CENTER, OBJECTS, SCALE, result_of
 
 from articulate_ssl.inference.articulation import posed_parts
 from articulate_ssl.inference.export import prediction_json
 
 
 def write(folder, make, **changes) -> dict:
-    (file,) = prediction_json.write(result_of(folder, make, **changes))
+    (file,) = prediction_json.write(result_of(make, **changes), folder)
     return json.loads(file.read_text())
 
 

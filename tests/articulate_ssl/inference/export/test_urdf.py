@@ -6,7 +6,7 @@ import synthetic_predictions as synthetic
 import torch
 import trimesh
 import yourdfpy
-from scan_results import OBJECTS, result_of
+from scan_predictions import OBJECTS, result_of
 
 from articulate_ssl.inference.articulation import articulate, posed_parts
 from articulate_ssl.inference.export import urdf
@@ -14,10 +14,10 @@ from articulate_ssl.inference.prediction import Prediction
 
 
 def write(folder, make) -> tuple[Prediction, yourdfpy.URDF]:
-    result = result_of(folder, make)
+    result = result_of(make)
     prediction = result.prediction
     limits = torch.tensor([[-0.1, 0.12]]).repeat(prediction.joint_state.shape[1], 1)
-    urdf.write(replace(result, limits=limits))
+    urdf.write(replace(result, limits=limits), folder)
     robot = yourdfpy.URDF.load(str(folder / "object.urdf"))
     robot.update_cfg({f"joint_{j}": state for j, state in enumerate(prediction.joint_state[0].tolist())})
     return prediction, robot

@@ -1,18 +1,16 @@
 """The predictions of `synthetic_predictions` as an export reads them."""
 
-from pathlib import Path
-
 import numpy as np
 import synthetic_predictions as synthetic
 import torch
 
-from articulate_ssl.inference.export.scan_result import ScanResult, in_scan_frame
+from articulate_ssl.inference.scan_prediction import ScanPrediction, in_scan_frame
 
 OBJECTS = [synthetic.laptop, synthetic.drawer, synthetic.arm]
 CENTER, SCALE = np.array([10.0, -3.0, 5.0]), 0.4
 
 
-def result_of(folder: Path, make, center=CENTER, scale=SCALE, **changes) -> ScanResult:
+def result_of(make, center=CENTER, scale=SCALE, **changes) -> ScanPrediction:
     prediction, points = make()
     points = points.numpy()
     arguments = dict(
@@ -25,4 +23,4 @@ def result_of(folder: Path, make, center=CENTER, scale=SCALE, **changes) -> Scan
         category="thing",
         checkpoint="thing.ckpt",
     )
-    return in_scan_frame(folder, **(arguments | changes))
+    return in_scan_frame(**(arguments | changes))

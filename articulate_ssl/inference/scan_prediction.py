@@ -1,10 +1,8 @@
-"""What there is to know about one predicted scan, in its own frame and units: all that an export may read."""
+"""What there is to know about one predicted scan, in its own frame and units: all that exports and viewers read."""
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, fields
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -20,28 +18,26 @@ JOINT_TYPE_NAMES = ("revolute", "prismatic")
 
 
 @dataclass(frozen=True)
-class ScanResult:
-    """A predicted scan and the folder for its files; (scan - center) / scale is what the network saw.
+class ScanPrediction:
+    """A predicted scan; (scan - center) / scale is what the network saw.
 
     Attributes:
-        folder: Where to write.
         prediction: B = 1, in the frame and the units of the scan, float64, on the CPU.
         cloud: [M, 3] the whole scan.
         part_id: [M] part of every point of it.
         limits: [J, 2] lowest and highest joint state: radians, or lengths in the units of the scan.
         category: What the network was trained on.
-        checkpoint: Path of the weights.
+        checkpoint: Path of the weights; None where no network had a say.
         center: [3], in the frame of the scan.
         scale: Units of the scan per normalised unit.
     """
 
-    folder: Path
     prediction: Prediction
     cloud: np.ndarray
     part_id: np.ndarray
     limits: Tensor
     category: str
-    checkpoint: str
+    checkpoint: str | None
     center: np.ndarray
     scale: float
 
@@ -56,7 +52,6 @@ def part_of_points(
 
 
 def in_scan_frame(
-    folder: str | os.PathLike,
     prediction: Prediction,  # B = 1, normalised space
     points: np.ndarray,  # [N, 3] the network's input, normalised
     center: np.ndarray,  # [3]
@@ -65,7 +60,7 @@ def in_scan_frame(
     state_range: Tensor,  # [J, 2] lowest and highest joint state, normalised units
     category: str,
     checkpoint: str,
-) -> ScanResult:
+) -> ScanPrediction:
     """Undo the normalisation, and give every point of the scan its part.
 
     Raises:
@@ -75,8 +70,7 @@ def in_scan_frame(
     _check(prediction, checkpoint)
     metric = to_input_frame(prediction.to("cpu"), torch.as_tensor(center, dtype=torch.float64), scale)
     prismatic = (metric.joint_type[0] == PRISMATIC)[:, None]
-    return ScanResult(
-        folder=Path(folder),
+    return ScanPrediction(
         prediction=metric,
         cloud=cloud,
         part_id=part_of_points(prediction, points, (cloud - center) / scale),
