@@ -3,11 +3,13 @@ SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup data preview test lint bench demo clean
+.PHONY: help setup data preview test lint bench demo weights weights-check clean
 
 PYTHON ?= python3
 CLUSTER ?=
 ARGS ?=
+CATEGORIES ?=
+VIEWS ?=
 
 VIEW ?= complete
 SOURCE ?= procedural
@@ -39,7 +41,7 @@ endif
 endif
 
 help: ## List these targets.
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-9s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 	@echo 'Options go behind the target, as in: make data CAT=laptop VIEW=partial'
 
 setup: $(packages) $(if $(filter 0,$(CLUSTER)),,$(cluster)) ## Make .venv; compile torch-scatter and torch-cluster (about 6 minutes, once) unless CLUSTER=0. [PYTHON=python3]
@@ -59,6 +61,7 @@ preview: $(needs) ## Draw a contact sheet of a category into build/preview: CAT=
 	$(bin)/python -m render.preview --category '$(CAT)' --source '$(SOURCE)' --seed '$(SEED)' $(if $(ROOT),--root '$(ROOT)') $(ARGS)
 
 test: $(needs) ## Set up without compiling (CLUSTER=1 compiles), then run the tests. [ARGS="options of pytest"]
+	@.ci/setup browser
 	$(bin)/python -m pytest $(ARGS)
 
 lint: $(needs) ## Check style and formatting.
@@ -80,6 +83,12 @@ demo: $(needs) ## Set up without compiling, make data, train briefly, test, pred
 	@find "$$PWD/build/demo/run" -name metrics.json -o -name '*.png' | sed 's/^/  /'
 	@echo 'Picture of the real laptop (tests/data/real_objects/laptop):'
 	@echo "  $$PWD/build/demo/prediction/picture.png"
+
+weights: $(needs) ## Make all shipped weights anew: 12 minutes each on a CPU, can be interrupted. [CATEGORIES="laptop oven" VIEWS="depth complete"]
+	$(bin)/articulate-ssl weights rebuild $(if $(CATEGORIES),--categories $(CATEGORIES)) $(if $(VIEWS),--views $(VIEWS))
+
+weights-check: $(needs) ## Test shipped weights on fresh data and compare with their cards. [CATEGORIES="laptop oven-depth" SEED=12]
+	$(bin)/articulate-ssl weights check $(CATEGORIES) $(if $(filter-out 0,$(SEED)),--seed $(SEED))
 
 clean: ## Remove build/, caches and the set-up; data/, runs/ and compiled wheels stay.
 	rm -rf build .venv *.egg-info .pytest_cache .ruff_cache .hypothesis

@@ -28,7 +28,8 @@ class ArticulatedDataModule(LightningDataModule):
         dense_points     [B, P, 3] all stored points; in training only with `dense_in_fit`
         dense_part_id    [B, P] part of each of them
 
-    and, for metrics only, every other array of `datamodules.shards.SHARD_ARRAYS` under its own name, integers as int64.
+    and, for metrics only, every other array of `datamodules.shards.SHARD_ARRAYS` under its own name, integers as int64;
+    without labels (`manifest.labelled`) only those of `UNLABELLED_ARRAYS`, and no `dense_part_id`.
     `datamodules.articulated_dataset.split_labels` separates inputs from labels.
 
     Training on complete clouds turns each cloud by a fresh uniform rotation every time it is drawn. What is drawn, and
@@ -176,6 +177,11 @@ class ArticulatedDataModule(LightningDataModule):
                 f"{folder}: has no training clouds to calibrate metrics on; name the set that the network was trained "
                 "on with --data.calibration_set"
             )
+        if not manifest.labelled:
+            raise ManifestError(
+                f"{folder}: has no labels to calibrate metrics on; name a labelled set of the same objects and view "
+                "with --data.calibration_set"
+            )
         rotate = manifest.view == "complete"
         dataset = ArticulatedDataset(folder, "train", options.num_points, rotate, verify=options.verify)
         return self._loader(dataset, EvaluationSampler(spread_subset(dataset.labels["instance"], samples)))
@@ -221,7 +227,7 @@ class ArticulatedDataModule(LightningDataModule):
         options = self.hparams
         words = [f"make data CAT={options.category} VIEW={options.view}"]
         words += [f"PROTOCOL={options.protocol}"] if options.protocol else []
-        words += [f"SOURCE={options.source}"] if options.source != "procedural" else []
+        words += [f"SOURCE={options.source} ROOT=path/to/it"] if options.source != "procedural" else []
         return " ".join([*words, f"OUT={options.root}"])
 
 

@@ -15,7 +15,7 @@ from torch.utils.data import Dataset
 
 from articulate_ssl.geometry.se3 import se3
 from datamodules.manifest import Manifest
-from datamodules.shards import SHARD_ARRAYS, ShardError, read_shard, sha256_of
+from datamodules.shards import SHARD_ARRAYS, UNLABELLED_ARRAYS, ShardError, read_shard, sha256_of
 
 POINT_ARRAYS = ("points", "part_id")
 LABEL_ARRAYS = tuple(name for name in SHARD_ARRAYS if name not in POINT_ARRAYS)
@@ -35,7 +35,8 @@ class ArticulatedDataset(Dataset):
     """Clouds and labels of one split as batches of tensors.
 
     The clouds stay mapped into memory; the small arrays are held in it. Random rotation and noise are a pure function
-    of (`seed`, key), whatever the number of workers and ranks and wherever a run was interrupted.
+    of (`seed`, key), whatever the number of workers and ranks and wherever a run was interrupted. A set without labels
+    gives the same clouds, and of the label arrays `datamodules.shards.UNLABELLED_ARRAYS` only.
 
     Args:
         folder: Data set folder, `<root>/<category>/<source>-<view>[-<protocol>]`.
@@ -71,14 +72,19 @@ class ArticulatedDataset(Dataset):
         shards = [
             self._open(Path(folder) / split / e.name, e.samples, e.sha256, verify) for e in manifest.shards[split]
         ]
+        for shard, entry in zip(shards, manifest.shards[split], strict=True):
+            if ("part_id" in shard) != manifest.labelled:
+                has = "no labels" if manifest.labelled else "labels"
+                raise ShardError(f"{Path(folder) / split / entry.name}: shard has {has}, the manifest says otherwise.")
         self._points = [shard["points"] for shard in shards]
-        self._part_id = [shard["part_id"] for shard in shards]
+        self._part_id = [shard["part_id"] for shard in shards] if manifest.labelled else None
         sizes = {points.shape[1] for points in self._points}
         if len(sizes) > 1:
             raise ShardError(f"{folder}: shards of the {split} split have clouds of different sizes {sorted(sizes)}.")
         if (available := sizes.pop()) < num_points:
             raise ValueError(f"{folder}: clouds have {available} points, num_points={num_points} asks for more.")
-        self.labels = {name: np.concatenate([shard[name] for shard in shards]) for name in LABEL_ARRAYS}
+        names = [name for name in LABEL_ARRAYS if manifest.labelled or name in UNLABELLED_ARRAYS]
+        self.labels = {name: np.concatenate([shard[name] for shard in shards]) for name in names}
         self._starts = np.cumsum([0] + [len(points) for points in self._points])
 
     @staticmethod
@@ -113,7 +119,7 @@ class ArticulatedDataset(Dataset):
         row = index - self._starts[shard]
         points = torch.from_numpy(self._gather(self._points, shard, row))
         batch = {name: torch.from_numpy(_widen(array[index])) for name, array in self.labels.items()}
-        if self.dense:
+        if self.dense and self._part_id is not None:
             batch["dense_part_id"] = torch.from_numpy(_widen(self._gather(self._part_id, shard, row)))
         points = self._augment(points, batch, keys)
         if self.dense:
@@ -142,9 +148,11 @@ class ArticulatedDataset(Dataset):
         if self.rotate:
             rotation = roma.unitquat_to_rotmat(quaternion / quaternion.norm(dim=-1, keepdim=True)).float()
             points = points @ rotation.mT
+            batch["center"] = (rotation @ batch["center"][..., None]).squeeze(-1)
+            if self._part_id is None:
+                return points
             for name in ("joint_axis", "joint_pivot"):
                 batch[name] = batch[name] @ rotation.mT
-            batch["center"] = (rotation @ batch["center"][..., None]).squeeze(-1)
             batch["object_rotation"] = rotation @ batch["object_rotation"]
             batch["part_pose"] = se3(rotation, rotation.new_zeros(3))[:, None] @ batch["part_pose"]
         return points

@@ -10,11 +10,14 @@ from typing import Any
 
 from datamodules.atomic import atomic_write
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 MANIFEST_NAME = "manifest.json"
 SPLITS = ("train", "test")
 VIEWS = ("complete", "partial")
 PROTOCOLS = ("honest", "eap")
+SPLIT_BY = ("instance", "scan")
+# Fields that older versions did not have, and what they mean there.
+_ADDED = {1: {"left_out": {}}, 2: {"labelled": True, "split_by": "instance", "scans": {"train": (), "test": ()}}}
 
 
 class ManifestError(ValueError):
@@ -45,13 +48,17 @@ class Manifest:
         part_names: K part names, in the order of `part_id`.
         joint_types: J joint types, 0 revolute, 1 prismatic.
         articulation_range: J pairs (lower, upper) of the sampled joint states, relative to the rest state; radians, or
-            length / rest-state bounding-box diagonal.
+            length / rest-state bounding-box diagonal. Empty if nothing is labelled.
         instances: Instance ids of each split; `instance` of the shards indexes into its split's ids.
         rest_state: J joint coordinates at rest of every instance id; radians, or length in the units of the source
-            (divide by `scale` of a sample to compare with its `joint_state`).
+            (divide by `scale` of a sample to compare with its `joint_state`). Empty if nothing is labelled.
         shards: Shards of each split, in the order of the global sample index.
         rejected_views: Views that were drawn again because a part showed too few points.
-        left_out: Why, by id, objects of the source are not in the set. Sets of schema version 1 did not record this.
+        left_out: Why, by id, objects (or scans) of the source are not in the set.
+        labelled: Whether the shards have labels. Where they have none, parts and joints are what the user says.
+        split_by: `instance`: no object is in both splits; `scan`: there is one object, some of whose scans test.
+        scans: Where nothing is labelled, the files of each split in the order of its samples, below the root folder;
+            each gives `options["rotations"]` samples of a complete test split, else one.
         schema_version: Version of this file's format.
     """
 
@@ -70,6 +77,9 @@ class Manifest:
     shards: dict[str, tuple[ShardEntry, ...]]
     rejected_views: int = 0
     left_out: dict[str, str] = field(default_factory=dict)
+    labelled: bool = True
+    split_by: str = "instance"
+    scans: dict[str, tuple[str, ...]] = field(default_factory=lambda: {split: () for split in SPLITS})
     schema_version: int = SCHEMA_VERSION
 
     def __post_init__(self) -> None:
@@ -79,27 +89,33 @@ class Manifest:
         protocols = PROTOCOLS if self.view == "partial" else (None,)
         if self.protocol not in protocols:
             raise ValueError(f"protocol is {self.protocol!r}, expected one of {protocols} for {self.view} views")
-        for name in ("instances", "shards"):
+        if self.split_by not in SPLIT_BY:
+            raise ValueError(f"split_by is {self.split_by!r}, expected one of {', '.join(SPLIT_BY)}")
+        for name in ("instances", "shards", "scans"):
             if sorted(getattr(self, name)) != sorted(SPLITS):
                 raise ValueError(f"{name} names the splits {sorted(getattr(self, name))}, expected {sorted(SPLITS)}")
         ids = [i for split in SPLITS for i in self.instances[split]]
-        if len(set(ids)) != len(ids):
+        if len(set(ids)) != len(ids) and self.split_by == "instance":
             raise ValueError("an instance id appears twice; splits must not share instances")
         if both := set(ids) & set(self.left_out):
             raise ValueError(f"instance {min(both)!r} is both in a split and left out")
-        if set(self.rest_state) != set(ids):
-            raise ValueError("rest_state must name exactly the instances of the splits")
         if not set(self.joint_types) <= {0, 1}:
             raise ValueError(f"joint_types are {list(self.joint_types)}, expected 0 (revolute) or 1 (prismatic)")
-        num_joints = len(self.joint_types)
-        if len(self.articulation_range) != num_joints or any(len(q) != num_joints for q in self.rest_state.values()):
-            raise ValueError(f"articulation_range and every rest_state must have {num_joints} entries, one per joint")
+        if self.labelled:
+            self._check_labels(ids)
         if any(shard.samples < 1 for split in SPLITS for shard in self.shards[split]):
             raise ValueError("a shard has no samples")
         for split in SPLITS:
             names = [shard.name for shard in self.shards[split]]
             if len(set(names)) != len(names) or any(Path(name).name != name for name in names):
                 raise ValueError(f"shard names of split {split!r} must be distinct plain file names")
+
+    def _check_labels(self, ids: list[str]) -> None:
+        if set(self.rest_state) != set(ids):
+            raise ValueError("rest_state must name exactly the instances of the splits")
+        num_joints = len(self.joint_types)
+        if len(self.articulation_range) != num_joints or any(len(q) != num_joints for q in self.rest_state.values()):
+            raise ValueError(f"articulation_range and every rest_state must have {num_joints} entries, one per joint")
 
     @property
     def num_parts(self) -> int:
@@ -133,8 +149,9 @@ class Manifest:
             raise ManifestError(f"{path}: manifest is not valid JSON ({error}). {remedy}") from error
         if not isinstance(content, dict):
             raise ManifestError(f"{path}: manifest is not a JSON object. {remedy}")
-        if content.get("schema_version") == 1:
-            content = {"left_out": {}} | content | {"schema_version": SCHEMA_VERSION}
+        for version, added in _ADDED.items():
+            if content.get("schema_version") == version:
+                content = added | content | {"schema_version": version + 1}
         if (version := content.get("schema_version")) != SCHEMA_VERSION:
             raise ManifestError(
                 f"{path}: schema version is {version!r}, this program reads version {SCHEMA_VERSION}. {remedy}"
@@ -152,6 +169,7 @@ class Manifest:
                     "articulation_range": tuple((low, high) for low, high in content["articulation_range"]),
                     "left_out": {instance: str(reason) for instance, reason in content["left_out"].items()},
                     "instances": {split: tuple(ids) for split, ids in content["instances"].items()},
+                    "scans": {split: tuple(files) for split, files in content["scans"].items()},
                     "rest_state": {instance: tuple(state) for instance, state in content["rest_state"].items()},
                     "shards": {s: tuple(ShardEntry(**entry) for entry in e) for s, e in content["shards"].items()},
                 }

@@ -1,4 +1,4 @@
-"""The npz shard format: S labelled clouds of one category in one file.
+"""The npz shard format: S clouds of one category in one file, with their labels or without any.
 
 Symbols: S samples, P points of a cloud, K parts, J joints. Everything is in normalised units,
 `points = (metric points - center) / scale`; camera space is the space of `points`. Radians.
@@ -17,6 +17,9 @@ Symbols: S samples, P points of a cloud, K parts, J joints. Everything is in nor
     object_rotation  canonical object frame -> camera space
     center, scale    of the normalisation, camera space, in the units of the source
 
+A set of scans that nobody labelled has shards of `UNLABELLED_ARRAYS` alone; there an instance is an object that was
+scanned, possibly several times.
+
 A shard is an uncompressed zip of npy files with fixed time stamps, so equal arrays give equal bytes. Every array starts
 at a multiple of 64 bytes, so readers map it into memory instead of reading it.
 """
@@ -29,7 +32,7 @@ import os
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -68,6 +71,8 @@ SHARD_ARRAYS: dict[str, ArraySpec] = {
     "scale": ArraySpec("float32", ("S",)),
 }
 
+UNLABELLED_ARRAYS = ("points", "instance", "center", "scale")
+
 # What zipfile and numpy raise on damaged headers; RuntimeError covers unsupported and encrypted members.
 STRUCTURE_ERRORS = (
     EOFError,
@@ -103,7 +108,7 @@ def write_shard(path: str | os.PathLike, arrays: Mapping[str, np.ndarray]) -> st
 
     Args:
         path: Final name; its folder must exist.
-        arrays: Exactly the arrays of `SHARD_ARRAYS`.
+        arrays: Exactly the arrays of `SHARD_ARRAYS`, or of `UNLABELLED_ARRAYS`.
 
     Raises:
         ShardError: if an array is missing, unknown, not finite, or of another dtype or shape than specified.
@@ -151,12 +156,13 @@ def read_shard(path: str | os.PathLike, expected_sha256: str | None = None) -> d
 
 def schema_problem(arrays: Mapping[str, tuple[np.dtype, tuple[int, ...]]]) -> str | None:
     """What is wrong with the dtypes and shapes of a shard's arrays, or None."""
-    if missing := [name for name in SHARD_ARRAYS if name not in arrays]:
+    specified = specified_arrays(arrays)
+    if missing := [name for name in specified if name not in arrays]:
         return f"array {missing[0]!r} is missing"
     if unknown := [name for name in arrays if name not in SHARD_ARRAYS]:
         return f"array {unknown[0]!r} is unknown"
     sizes: dict[str, int] = {}
-    for name, spec in SHARD_ARRAYS.items():
+    for name, spec in specified.items():
         dtype, shape = arrays[name]
         if dtype != np.dtype(spec.dtype):
             return f"array {name!r} has dtype {dtype}, expected {spec.dtype}"
@@ -166,15 +172,21 @@ def schema_problem(arrays: Mapping[str, tuple[np.dtype, tuple[int, ...]]]) -> st
         ):
             return f"array {name!r} has shape {list(shape)}, expected [{', '.join(map(str, expected))}]"
         sizes.update((size, n) for size, n in zip(spec.shape, shape, strict=True) if isinstance(size, str))
-    if empty := [size for size in "SPK" if sizes[size] == 0]:
+    if empty := [size for size in "SPK" if sizes.get(size) == 0]:
         return f"size {empty[0]} is zero"
     return None
+
+
+def specified_arrays(found: Iterable[str]) -> dict[str, ArraySpec]:
+    """The arrays that a shard must have, in order: all if there is any label among those found in it."""
+    labelled = set(found) & set(SHARD_ARRAYS) - set(UNLABELLED_ARRAYS)
+    return {name: spec for name, spec in SHARD_ARRAYS.items() if labelled or name in UNLABELLED_ARRAYS}
 
 
 def _write_npz(file: BinaryIO, arrays: Mapping[str, np.ndarray]) -> None:
     """An uncompressed npz in the order of `SHARD_ARRAYS`, its bytes a function of the arrays alone."""
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        for name in SHARD_ARRAYS:
+        for name in specified_arrays(arrays):
             content = io.BytesIO()
             np.lib.format.write_array(content, np.ascontiguousarray(arrays[name]), version=(1, 0), allow_pickle=False)
             member = zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))

@@ -65,6 +65,14 @@ def verify_set(
 
 def label_problems(arrays: Arrays, manifest: Manifest, split: str) -> Iterator[str]:
     """What is wrong with the values of one shard's arrays. Each problem names the first sample that has it."""
+    if ("part_id" in arrays) != manifest.labelled:
+        yield f"has {'no labels' if manifest.labelled else 'labels'}, the manifest says otherwise"
+        return
+    if not manifest.labelled:
+        for problem, bad in (*_instance_check(arrays, manifest, split), *_value_checks(arrays)):
+            if bad.any():
+                yield _describe(problem, bad)
+        return
     found, expected = (
         (arrays["part_pose"].shape[1], arrays["joint_type"].shape[1]),
         (manifest.num_parts, len(manifest.joint_types)),
@@ -73,7 +81,7 @@ def label_problems(arrays: Arrays, manifest: Manifest, split: str) -> Iterator[s
         yield "has {} parts and {} joints, the manifest says {} and {}".format(*found, *expected)
         return
     indices_sound = True
-    for problem, bad in _index_checks(arrays, manifest, split):
+    for problem, bad in (*_instance_check(arrays, manifest, split), *_index_checks(arrays, manifest)):
         if bad.any():
             indices_sound = False
             yield _describe(problem, bad)
@@ -111,14 +119,19 @@ def _describe(problem: str, bad: np.ndarray) -> str:
     return f"{problem} (sample {samples[0]} and {len(samples) - 1} more of {len(bad)})"
 
 
-def _index_checks(arrays: Arrays, manifest: Manifest, split: str) -> Iterator[tuple[str, np.ndarray]]:
+def _instance_check(arrays: Arrays, manifest: Manifest, split: str) -> Iterator[tuple[str, np.ndarray]]:
+    """Like `_index_checks`, of what every set has."""
+    instances = len(manifest.instances[split])
+    yield f"instance is outside 0..{instances - 1}", (arrays["instance"] < 0) | (arrays["instance"] >= instances)
+
+
+def _index_checks(arrays: Arrays, manifest: Manifest) -> Iterator[tuple[str, np.ndarray]]:
     """Checks of the integer labels: pairs of a problem and the [S, ...] mask of where it occurs."""
-    num_parts, instances = manifest.num_parts, len(manifest.instances[split])
+    num_parts = manifest.num_parts
     part_id, parent, child = arrays["part_id"], arrays["joint_parent"], arrays["joint_child"]
     yield f"part_id is outside 0..{num_parts - 1}", part_id >= num_parts
     for part, name in enumerate(manifest.part_names):
         yield f"no point belongs to part {name!r}", ~(part_id == part).any(1)
-    yield f"instance is outside 0..{instances - 1}", (arrays["instance"] < 0) | (arrays["instance"] >= instances)
     for name, index in (("joint_parent", parent), ("joint_child", child)):
         yield f"{name} is outside 0..{num_parts - 1}", (index < 0) | (index >= num_parts)
     yield "joint_type differs from the manifest's", arrays["joint_type"] != np.array(manifest.joint_types, np.uint8)
@@ -141,6 +154,8 @@ def _value_checks(arrays: Arrays) -> Iterator[tuple[str, np.ndarray]]:
         if array.dtype.kind == "f":
             yield f"{name} has NaN or infinite values", ~np.isfinite(array)
     yield "scale is not positive", arrays["scale"] <= 0
+    if "part_pose" not in arrays:
+        return
     yield "joint_axis is not of unit length", _exceeds(np.linalg.norm(arrays["joint_axis"], axis=-1) - 1)
     for name in ("object_rotation", "part_pose"):
         rotation = arrays[name][..., :3, :3].astype(np.float64)

@@ -8,7 +8,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from render.execution import run_tasks
-from render.generate import choose_renderer, split_instances
+from render.generate import choose_renderer
+from render.object_set import split_instances
 from render.shard_task import SetOptions, plan_shards
 
 _OPTIONS = SetOptions(
@@ -45,7 +46,8 @@ def _samples_per_s(options: SetOptions, workers: int) -> float:
     """Samples per second while every worker is busy: the time in which workers start and load libraries is left out."""
     with TemporaryDirectory() as folder:
         (Path(folder) / "train").mkdir()
-        tasks = plan_shards(options, Path(folder), "train", list(split_instances(options)["train"]))
+        instances = split_instances(options, options.open().instance_ids())
+        tasks = plan_shards(options, Path(folder), "train", instances["train"])
         finished = [(time.perf_counter(), result.samples) for result in run_tasks(tasks, workers)]
     # Counted from the moment when the last worker has delivered its first shard.
     start, _ = finished[workers - 1]

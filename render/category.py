@@ -1,5 +1,7 @@
 """Category specifications: everything the generator knows about a category, as data in `render/categories/*.yaml`.
 
+A user's own category is such a file too; it need not say what `parse_category` has a default for.
+
 Convention:
     The canonical object frame has y up, z to the front (the side a user faces) and x to the user's right.
     Revolute joints of every source open with growing coordinate: 0 is closed for doors and lids, unfolded for legs.
@@ -7,17 +9,35 @@ Convention:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import resources
 from math import radians
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import yaml
 
 from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE
 from render.articulated_object import ArticulatedObject, Joint
+
+JOINT_TYPES = MappingProxyType({"revolute": REVOLUTE, "prismatic": PRISMATIC})
+
+_NAME = re.compile(r"[A-Za-z0-9][\w-]*", re.ASCII)  # it becomes that of a folder
+# What a user's file need not say.
+_DEFAULTS = MappingProxyType(
+    {
+        "instances": {"train": 8000, "test": 2000},  # all there are, a fifth of them for test
+        # As of laptops, from where a person sees an object in front; chosen.
+        "view": {"azimuth_deg": [-60, 60], "elevation_deg": [15, 70], "roll_deg": [-15, 15], "resolution": 256},
+        "min_visible_points": 100,
+        "recognition": None,
+        "variants": {},
+    }
+)
 
 
 @dataclass(frozen=True)
@@ -97,8 +117,8 @@ class CategorySpec:
         test_instances: Default number of test instances.
         view: Range of partial views.
         min_visible_points: Fewest points of a stored partial cloud that every part must have.
-        recognition: How to find the category's parts in foreign objects; None for `articulated`, whose `parts` and
-            `joints` are empty because it takes every object as it is.
+        recognition: How to find the category's parts in foreign objects; None for one that does not say, and for
+            `articulated`, whose `parts` and `joints` are empty because it takes every object as it is.
         variants: Options of the procedural design by the name of a variant of the category.
         variant: The variant that this is; None for the category itself.
     """
@@ -178,50 +198,163 @@ def category_names() -> tuple[str, ...]:
 def load_category(name: str, variant: str | None = None) -> CategorySpec:
     """The specification of a category, or of a variant that its file names under `variants`.
 
+    Args:
+        name: Of a built-in category, or the path of a user's own `.yaml`, named as the category.
+        variant: See above.
+
     Raises:
-        ValueError: if there is no such category or variant.
+        ValueError: if there is no such category or variant, or its file is unsound, saying what is missing.
     """
-    if name not in category_names():
-        raise ValueError(f"unknown category {name!r}; choose one of {', '.join(category_names())}")
-    text = (resources.files("render.categories") / f"{name}.yaml").read_text(encoding="utf-8")
-    content = yaml.safe_load(text)
-    variants = content.get("variants", {})
+    return parse_category(*category_text(name), variant)
+
+
+def category_text(name: str) -> tuple[str, str]:
+    """Name and YAML of a built-in category, or of a file.
+
+    Raises:
+        ValueError: if there is none, or its name cannot be that of a folder.
+    """
+    if name in category_names():
+        return name, (resources.files("render.categories") / f"{name}.yaml").read_text(encoding="utf-8")
+    path = Path(name)
+    if path.suffix not in (".yaml", ".yml"):
+        raise ValueError(
+            f"unknown category {name!r}; choose one of {', '.join(category_names())}, or name the .yaml file of yours"
+        )
+    require_folder_name(path.stem)
+    try:
+        return path.stem, path.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
+
+
+def require_folder_name(name: str) -> None:
+    """Raise ValueError if a category's name cannot be that of a folder."""
+    if not _NAME.fullmatch(name):
+        raise ValueError(f"category name {name!r}: use letters, digits, - and _ only; folders are named after it")
+
+
+def made_category(num_parts: int, joint_type: str) -> str:
+    """YAML of a category of which nothing is known but the number of its parts and the type of its joints."""
+    parts = [f"part_{k}" for k in range(num_parts)]
+    return yaml.safe_dump({"parts": parts, "joints": [{"type": joint_type} for _ in parts[1:]]}, sort_keys=False)
+
+
+@cache
+def parse_category(name: str, text: str, variant: str | None = None) -> CategorySpec:
+    """The specification that a YAML text states.
+
+    Needed are `parts` (the base first) and `joints` (one less, each with its `type`). What else a file may say, and
+    what holds where it does not: a joint's `name` (`joint_<number>`), `parent` (the base), `child` (the next part),
+    `range_deg` ([0, 90]) or `range_travel` ([0, 1]), `rest_deg` or `rest_travel` (the lower end); `instances` (a
+    fifth for test), `view`, `min_visible_points`, `recognition` and `variants`, as the built-in categories have them.
+
+    Raises:
+        ValueError: naming the category and what is missing or wrong.
+    """
+    try:
+        content = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ValueError(f"category {name!r}: its file is not YAML ({' '.join(str(error).split())})") from error
+    try:
+        return _specification(name, content, variant)
+    except _Unsound as error:
+        raise ValueError(f"category {name!r}: {error}") from error
+
+
+class _Unsound(ValueError):
+    """What is wrong with a category's file."""
+
+
+def _specification(name: str, content: Any, variant: str | None) -> CategorySpec:
+    _require_keys("its file", content, {"parts", "joints"}, set(_DEFAULTS))
+    content = _DEFAULTS | content
+    variants = content["variants"]
     if variant is not None and variant not in variants:
         raise ValueError(f"category {name!r} has no variant {variant!r}; it has {', '.join(variants) or 'none'}")
-    parts, view = tuple(content["parts"]), content["view"]
+    parts, joints = content["parts"], content["joints"]
+    for key, value in (("parts", parts), ("joints", joints)):
+        if not isinstance(value, list):
+            raise _Unsound(f"{key} must be a list, not {value!r}")
+    parts = tuple(map(str, parts))
+    if len(set(parts)) != len(parts):
+        raise _Unsound(f"a part is named twice: {', '.join(parts)}")
+    if parts and (len(parts) < 2 or len(joints) != len(parts) - 1):
+        raise _Unsound(
+            f"has {len(parts)} parts and {len(joints)} joints; it needs two parts or more, and one joint less"
+        )
+    view = content["view"]
+    _require_keys("view", view, {"azimuth_deg", "elevation_deg", "roll_deg", "resolution"})
+    _require_keys("instances", content["instances"], {"train", "test"})
+    recognition = content["recognition"] if joints else None
+    if recognition is not None:
+        _require_keys("recognition", recognition, {"zero", "front", "order", "sources"})
     return CategorySpec(
         name=name,
         parts=parts,
-        joints=tuple(_joint_spec(joint, parts) for joint in content["joints"]),
+        joints=tuple(_joint_spec(number, joint, parts) for number, joint in enumerate(joints)),
         train_instances=content["instances"]["train"],
         test_instances=content["instances"]["test"],
         view=ViewSpec(
-            azimuth=_radians(view["azimuth_deg"]),
-            elevation=_radians(view["elevation_deg"]),
-            roll=_radians(view["roll_deg"]),
+            azimuth=_radians("view: azimuth_deg", view["azimuth_deg"]),
+            elevation=_radians("view: elevation_deg", view["elevation_deg"]),
+            roll=_radians("view: roll_deg", view["roll_deg"]),
             resolution=view["resolution"],
         ),
         min_visible_points=content["min_visible_points"],
-        recognition=RecognitionSpec(**content["recognition"]) if content["joints"] else None,
+        recognition=None if recognition is None else RecognitionSpec(**recognition),
         variants=variants,
         variant=variant,
     )
 
 
-def _joint_spec(joint: dict, parts: tuple[str, ...]) -> JointSpec:
+def _joint_spec(number: int, joint: Any, parts: tuple[str, ...]) -> JointSpec:
+    where = f"joint {number}"
+    ranges = {"range_deg", "rest_deg", "range_travel", "rest_travel"}
+    _require_keys(where, joint, {"type"}, {"name", "parent", "child"} | ranges)
+    if joint["type"] not in JOINT_TYPES:
+        raise _Unsound(f"{where} has type {joint['type']!r}; there are {' and '.join(JOINT_TYPES)}")
+    parent, child = joint.get("parent", parts[0]), joint.get("child", parts[number + 1])
+    for part in (parent, child):
+        if part not in parts:
+            raise _Unsound(f"{where} names the part {part!r}; there are {', '.join(parts)}")
     revolute = joint["type"] == "revolute"
-    lower, upper = _radians(joint["range_deg"]) if revolute else joint["range_travel"]
+    unit = "deg" if revolute else "travel"
+    if foreign := ranges & set(joint) - {f"range_{unit}", f"rest_{unit}"}:
+        raise _Unsound(f"{where} is {joint['type']} and has {min(foreign)}; it may have range_{unit} and rest_{unit}")
+    lower, upper = _range(f"{where}: range_{unit}", joint.get(f"range_{unit}", [0, 90] if revolute else [0, 1]))
+    rest = _number(f"{where}: rest_{unit}", joint.get(f"rest_{unit}", lower))
+    lower, upper, rest = (radians(v) if revolute else v for v in (lower, upper, rest))
     return JointSpec(
-        name=joint["name"],
-        type=REVOLUTE if revolute else PRISMATIC,
-        parent=parts.index(joint["parent"]),
-        child=parts.index(joint["child"]),
-        lower=lower,
-        upper=upper,
-        rest=radians(joint["rest_deg"]) if revolute else joint["rest_travel"],
-    )
+        joint.get("name", f"joint_{number}"), JOINT_TYPES[joint["type"]], *map(parts.index, (parent, child)),
+        lower, upper, rest,
+    )  # fmt: skip
 
 
-def _radians(degrees: list[float]) -> tuple[float, float]:
-    lower, upper = degrees
+def _require_keys(where: str, content: Any, needed: Set[str], optional: Set[str] = frozenset()) -> None:
+    if not isinstance(content, dict):
+        raise _Unsound(f"{where} must be a mapping of {', '.join(sorted(needed))}, not {content!r}")
+    if missing := sorted(needed - set(content)):
+        raise _Unsound(f"{where} lacks {', '.join(missing)}")
+    if unknown := sorted(map(str, set(content) - needed - optional)):
+        raise _Unsound(f"{where} has unknown {', '.join(unknown)}; known are {', '.join(sorted(needed | optional))}")
+
+
+def _range(where: str, values: Any) -> tuple[float, float]:
+    if not isinstance(values, list) or len(values) != 2:
+        raise _Unsound(f"{where} must be [lowest, highest], not {values!r}")
+    lower, upper = (_number(where, value) for value in values)
+    if lower > upper:
+        raise _Unsound(f"{where} must be [lowest, highest], not {values!r}")
+    return lower, upper
+
+
+def _number(where: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise _Unsound(f"{where} must be a number, not {value!r}")
+    return value
+
+
+def _radians(where: str, degrees: Any) -> tuple[float, float]:
+    lower, upper = _range(where, degrees)
     return radians(lower), radians(upper)

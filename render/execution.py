@@ -1,4 +1,4 @@
-"""Running shard tasks: in this process, in worker processes, or on a Dask cluster."""
+"""Running tasks: in this process, in worker processes, or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -8,16 +8,24 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-
-from render.shard_task import ShardResult, ShardTask, make_shard
+from typing import Protocol, TypeVar
 
 # Read by the numerical libraries when a worker imports them: parallelism comes from workers, not from threads.
 _ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "LP_NUM_THREADS")}
 
 _START_METHOD = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
 
+Result = TypeVar("Result", covariant=True)
 
-def run_tasks(tasks: list[ShardTask], workers: int, scheduler: str | None = None) -> Iterator[ShardResult]:
+
+class Task(Protocol[Result]):
+    """A piece of work that can be sent to another process."""
+
+    def make(self) -> Result:
+        """Do it."""
+
+
+def run_tasks(tasks: list[Task[Result]], workers: int, scheduler: str | None = None) -> Iterator[Result]:
     """Results in the order in which they finish. The first error of a task ends the run.
 
     Args:
@@ -32,21 +40,25 @@ def run_tasks(tasks: list[ShardTask], workers: int, scheduler: str | None = None
     if scheduler is not None:
         yield from _run_dask(tasks, scheduler)
     elif workers == 1 or len(tasks) < 2:
-        yield from map(make_shard, tasks)
+        yield from map(_make, tasks)
     else:
         yield from _run_pool(tasks, workers)
 
 
-def _run_pool(tasks: list[ShardTask], workers: int) -> Iterator[ShardResult]:
+def _make(task: Task[Result]) -> Result:
+    return task.make()
+
+
+def _run_pool(tasks: list[Task[Result]], workers: int) -> Iterator[Result]:
     # Not fork: a fork after a GL context was used hangs. The fork server is a fresh process that only imports.
     context = multiprocessing.get_context(_START_METHOD)
     if _START_METHOD == "forkserver":
-        context.set_forkserver_preload([__name__])
+        context.set_forkserver_preload(sorted({__name__, *(type(task).__module__ for task in tasks)}))
     previous = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(_ONE_THREAD)
     try:
         with ProcessPoolExecutor(min(workers, len(tasks)), mp_context=context, initializer=_end_with_parent) as pool:
-            futures = [pool.submit(make_shard, task) for task in tasks]
+            futures = [pool.submit(_make, task) for task in tasks]
             try:
                 for future in as_completed(futures):
                     yield future.result()
@@ -72,13 +84,13 @@ def _end_with_parent() -> None:
     threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
 
 
-def _run_dask(tasks: list[ShardTask], scheduler: str) -> Iterator[ShardResult]:
+def _run_dask(tasks: list[Task[Result]], scheduler: str) -> Iterator[Result]:
     try:
         from dask.distributed import Client, as_completed
     except ImportError as error:
         raise ValueError("--scheduler needs Dask: pip install 'articulate-ssl[dask]'") from error
     with Client(scheduler) as client:
         # Not pure: a shard that was deleted must be written again, whatever Dask remembers of it.
-        futures = client.map(make_shard, tasks, pure=False)
+        futures = client.map(_make, tasks, pure=False)
         for _, result in as_completed(futures, with_results=True):
             yield result

@@ -11,15 +11,15 @@ import numpy as np
 from articulate_ssl.geometry.screw import PRISMATIC
 from datamodules.shards import SHARD_ARRAYS, write_shard
 from render.articulated_object import ArticulatedObject
-from render.category import load_category
+from render.category import CategorySpec, load_category, parse_category
 from render.complete_cloud import ReachableSurface
 from render.partial_cloud import DepthSensor
 from render.posing import pose_labels, sample_rotation, sample_states
 from render.seeds import generator_for
-from render.sources import open_source
+from render.sources import Source, open_source
 
 SAMPLES_PER_SHARD = 250
-_REACH_STATES = 8  # in which a sensor looks for reachable surface; parts must hide each other in different ways
+_REACH_STATES = 8  # in which a sensor looks at an object first; parts must hide each other in different ways
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class SetOptions:
     """Everything that decides the bytes of a data set.
 
     Attributes:
-        category: One of `render.category.category_names()`.
+        category: Name of the category.
         source: One of `render.sources.SOURCES`.
         root: Folder of an external source's data set.
         view: `complete` or `partial`.
@@ -43,6 +43,7 @@ class SetOptions:
         noise_std: Standard deviation of the depth noise, in units of the rest-state bounding-box diagonal.
         renderer: One of `render.partial_cloud.RENDERERS` for partial views, None for complete clouds.
         variant: Of the category's procedural designs; None for the category itself.
+        specification: YAML of a user's own category; None for a built-in one.
     """
 
     category: str
@@ -61,6 +62,22 @@ class SetOptions:
     noise_std: float
     renderer: str | None
     variant: str | None = None
+    specification: str | None = None
+
+    @property
+    def spec(self) -> CategorySpec:
+        """The category."""
+        if self.specification is None:
+            return load_category(self.category, self.variant)
+        return parse_category(self.category, self.specification, self.variant)
+
+    def open(self) -> Source:
+        """Where the objects come from.
+
+        Raises:
+            ValueError: see `render.sources.open_source`.
+        """
+        return open_source(self.source, self.spec, None if self.root is None else Path(self.root), self.seed)
 
     def copies(self, split: str) -> int:
         """Stored samples per articulation state."""
@@ -86,10 +103,14 @@ class ShardTask:
     first_state: int
     last_state: int
 
+    def make(self) -> ShardResult:
+        """See `make_shard`."""
+        return make_shard(self)
+
 
 @dataclass(frozen=True)
 class ShardResult:
-    """What the manifest needs to know about a finished shard and its instance.
+    """What the manifest needs to know about a finished shard and its instance; the latter only of posed objects.
 
     Attributes:
         part_names: K names.
@@ -103,12 +124,12 @@ class ShardResult:
     name: str
     samples: int
     sha256: str
-    instance_id: str
-    part_names: tuple[str, ...]
-    joint_types: tuple[int, ...]
-    rest_state: tuple[float, ...]
-    articulation_range: tuple[tuple[float, float], ...]
-    rejected_views: int
+    instance_id: str = ""
+    part_names: tuple[str, ...] = ()
+    joint_types: tuple[int, ...] = ()
+    rest_state: tuple[float, ...] = ()
+    articulation_range: tuple[tuple[float, float], ...] = ()
+    rejected_views: int = 0
 
 
 def plan_shards(options: SetOptions, folder: Path, split: str, instance_ids: list[str]) -> list[ShardTask]:
@@ -141,9 +162,9 @@ def make_shard(task: ShardTask) -> ShardResult:
         ValueError: if the instance is unsound or cannot be sampled.
         OSError: if the shard cannot be written.
     """
-    options, spec = task.options, load_category(task.options.category)
+    options = task.options
     instance = _load_instance(options, task.instance_id)
-    ranges = spec.sampled_ranges(instance)
+    ranges = options.spec.sampled_ranges(instance)
     all_states = sample_states(ranges, options.states, _generator(task, "states"))
     make_samples = _partial_samples if options.view == "partial" else _complete_samples
     samples = []
@@ -167,6 +188,42 @@ def make_shard(task: ShardTask) -> ShardResult:
         articulation_range=tuple(map(tuple, ((np.array(ranges) - rest[:, None]) / unit[:, None]).tolist())),
         rejected_views=sum(sample.pop("rejected_views", 0) for sample in samples),
     )
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What came of reading one object, or scan.
+
+    Attributes:
+        name: Its id.
+        problem: Why it cannot be used, naming its file; empty if it can.
+    """
+
+    name: str
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class ObjectCheck:
+    """Read an object and try to sample it, before any shard is made."""
+
+    options: SetOptions
+    instance_id: str
+
+    def make(self) -> Reading:
+        """Whether shards can be made of it."""
+        try:
+            instance = _load_instance(self.options, self.instance_id)
+            if self.options.view == "complete":
+                _reachable_surface(self.options, "check", self.instance_id)
+            else:
+                rng = generator_for(self.options.seed, "check", self.instance_id)
+                sensor = _depth_sensor(self.options, self.instance_id)
+                for state in sample_states(self.options.spec.sampled_ranges(instance), _REACH_STATES, rng):
+                    sensor.observe(instance.part_motion(state), rng)
+        except (ValueError, OSError) as error:
+            return Reading(self.instance_id, str(error))
+        return Reading(self.instance_id)
 
 
 def _generator(task: ShardTask, *key: str | int) -> np.random.Generator:
@@ -224,9 +281,7 @@ def _stack(samples: list[dict[str, np.ndarray]], instance: ArticulatedObject, in
 @lru_cache(maxsize=1)
 def _load_instance(options: SetOptions, instance_id: str) -> ArticulatedObject:
     """The validated instance in its category's rest state; kept for the next shard of the same instance."""
-    spec, root = load_category(options.category, options.variant), None if options.root is None else Path(options.root)
-    instance = open_source(options.source, spec, root, options.seed).load(instance_id)
-    return spec.to_rest(instance.validate())
+    return options.spec.to_rest(options.open().load(instance_id).validate())
 
 
 @lru_cache(maxsize=1)
@@ -234,14 +289,14 @@ def _reachable_surface(options: SetOptions, split: str, instance_id: str) -> Rea
     """The instance's pool of reachable points; kept for the next shard of the same instance."""
     instance = _load_instance(options, instance_id)
     rng = generator_for(options.seed, split, instance_id, "surface")
-    states = sample_states(load_category(options.category).sampled_ranges(instance), _REACH_STATES, rng)
+    states = sample_states(options.spec.sampled_ranges(instance), _REACH_STATES, rng)
     return ReachableSurface(instance, states, rng)
 
 
 @lru_cache(maxsize=1)
 def _depth_sensor(options: SetOptions, instance_id: str) -> DepthSensor:
     """The sensor that looks at the instance; kept for the next shard of the same instance."""
-    spec = load_category(options.category)
+    spec = options.spec
     return DepthSensor(
         _load_instance(options, instance_id),
         spec.view,

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parent.parent
 # From low to high: a folder of articulate_ssl imports itself and lower ones only (docs/architecture.md).
 LAYERS = (
     *("geometry", "ops", "shape", "network", "losses", "discovery", "inference"),
-    *("metrics", "baselines", "training", "benchmark", "cli"),
+    *("metrics", "baselines", "training", "pretrained", "benchmark", "cli"),
 )
 # Of articulate_ssl, geometry is everybody's.
 FORBIDDEN = {
@@ -82,7 +82,7 @@ def test_every_module_of_the_method_is_in_a_layer() -> None:
 
 
 def test_make_targets_that_documents_name_exist() -> None:
-    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE))
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE))
     documents = [
         ROOT / "README.md",
         ROOT / ".ci" / "run",
@@ -93,7 +93,7 @@ def test_make_targets_that_documents_name_exist() -> None:
         (str(path.relative_to(ROOT)), target)
         for path in documents
         # In prose, "make" is a verb: only commands count, at the start of a line or in backquotes.
-        for target in re.findall(r"(?:^[ #$]*|`)make ([a-z]+)", path.read_text(), flags=re.MULTILINE)
+        for target in re.findall(r"(?:^[ #$]*|`)make ([a-z-]+)", path.read_text(), flags=re.MULTILINE)
     }
     assert (".ci/run", "test") in {(path.replace("\\", "/"), target) for path, target in named}
     assert {(path, target) for path, target in named if target not in targets} == set()

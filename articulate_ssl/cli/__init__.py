@@ -1,4 +1,4 @@
-"""The command line: `lightning fit|validate|test -c configs/<category>.yaml`, and `lightning predict CLOUD --ckpt …`.
+"""The command line: `lightning fit|validate|test -c configs/<category>.yaml`, `lightning predict CLOUD --category …`, …
 
 Both console scripts, `lightning` and `articulate-ssl`, are this program. A command is a module of this folder that
 offers `run(arguments: list[str]) -> int`: it takes all words of the command line, its own name first, and returns the
@@ -12,7 +12,12 @@ from importlib import import_module
 
 BAD_INPUT = 2  # the exit code
 # Modules are imported only to run them, because the training code takes long to import.
-COMMANDS = {"predict": "articulate_ssl.cli.predict"}
+COMMANDS = {
+    "predict": "articulate_ssl.cli.predict",
+    "twin": "articulate_ssl.cli.twin",
+    "view": "articulate_ssl.cli.view",
+    "weights": "articulate_ssl.cli.weights",
+}
 # Lightning's own parser knows fit, validate, test and --help, and refuses what nobody knows.
 OTHERWISE = "articulate_ssl.cli.learn"
 

@@ -1,54 +1,55 @@
-"""`lightning predict CLOUD --ckpt …`: from a scan and a checkpoint to a folder of results."""
+"""`lightning predict CLOUD --category laptop`: from a scan to a folder of results, by the weights of the package.
+
+A thin client of the Python interface (`articulate_ssl.load`): what it prints and writes, a program can have.
+"""
 
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 from pathlib import Path
-from typing import Protocol
 
-import numpy as np
 import torch
 from rich.console import Console
+from rich.progress import track
 from rich.table import Table
-from torch import Tensor
 
 from articulate_ssl.cli import BAD_INPUT
-from articulate_ssl.geometry.orientation_range import OrientationRange
 from articulate_ssl.inference.checkpoint_file import CheckpointError
-from articulate_ssl.inference.export.folder import write_prediction
-from articulate_ssl.inference.point_cloud_io import PointCloudError, load_point_cloud
-from articulate_ssl.inference.prediction import Prediction
-from articulate_ssl.inference.scan_prediction import in_scan_frame
+from articulate_ssl.inference.export.folder import EXPORTERS_BY_NAME, ExportError, exporters_named
+from articulate_ssl.inference.export.physics_check import PhysicsCheckError
+from articulate_ssl.inference.scan_prediction import ScanPrediction
+from articulate_ssl.training.shipped_weights import shipped_weights
+from articulate_ssl.training.weights_card import VIEWS
+from datamodules.point_cloud_io import PointCloudError, load_point_cloud
 
-
-class CloudPredictor(Protocol):
-    """What this command asks of a trained module.
-
-    Attributes:
-        category: What it was trained on.
-        state_range: [J, 2] lowest and highest joint state, as `Prediction.joint_state`.
-        orientation: How far objects were turned in the clouds that it was trained on.
-    """
-
-    category: str
-    state_range: Tensor
-    orientation: OrientationRange
-
-    def predict_cloud(
-        self,
-        points: np.ndarray,  # [N, 3] any unit and origin
-        refine: bool,
-    ) -> tuple[Prediction, np.ndarray, float, np.ndarray]:
-        """Prediction (B = 1), center [3] and scale of the normalisation, and the normalised points that it labels."""
+AUTO = "auto"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument("cloud", type=Path, help="scan of one object: .ply, .pcd, .npy, .npz or .obj, in any unit")
-    parser.add_argument("--ckpt", type=Path, required=True, help="checkpoint that `lightning fit` wrote")
+    weights = parser.add_mutually_exclusive_group(required=True)
+    categories = dict.fromkeys(weights.category for weights in shipped_weights())
+    weights.add_argument(
+        "--category",
+        choices=[*categories, AUTO],
+        help="use the weights of the package for this category; auto: of the category that explains the scan best",
+    )
+    weights.add_argument(
+        "--ckpt",
+        help="use these weights: a checkpoint of `lightning fit`, a .safetensors file, a folder of `save_pretrained`, "
+        "or a repository on the Hugging Face hub",
+    )
+    parser.add_argument(
+        "--view",
+        choices=[*VIEWS, AUTO],
+        default=AUTO,
+        help="how the scan was taken, with --category: "
+        + "; ".join(f"{view}: {what}" for view, what in VIEWS.items())
+        + "; auto (default): whichever weights explain the scan better",
+    )
     parser.add_argument("--out", type=Path, help="folder for the results (default: <name of the scan>-prediction)")
     parser.add_argument("--device", type=_device, default="cpu", help="cpu (default), cuda, cuda:1, …")
     parser.add_argument(
@@ -56,6 +57,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action=argparse.BooleanOptionalAction,
         default=True,
         help="sharpen the prediction by a few optimisation steps on the reconstruction (default: yes)",
+    )
+    parser.add_argument(
+        "--formats",
+        type=_formats,
+        help=f"what to write, with commas between: {', '.join(EXPORTERS_BY_NAME)} (default: all that can be written)",
+    )
+    parser.add_argument("--html", action="store_true", help="also write a page to look at and move it in a browser")
+    parser.add_argument(
+        "--check", action="store_true", help="let MuJoCo drop it and move its joints, and say how it went"
     )
 
 
@@ -73,38 +83,97 @@ def run(arguments: list[str]) -> int:
     )
     add_arguments(parser)
     args = parser.parse_args(arguments[1:])
+    if args.ckpt and args.view != AUTO:
+        parser.error("--view chooses among the weights of the package: give it with --category, or leave it out")
     out = args.out or Path(f"{args.cloud.stem}-prediction")
     try:
-        module, files = _predict(args, out)
-    except (PointCloudError, CheckpointError, OSError) as error:
+        candidates, limited = _predict(args)
+        files = _write(candidates[0], out, args)
+        _print_summary(candidates, files, limited)
+        if args.check:
+            _print_check(out)
+    except (PointCloudError, CheckpointError, ExportError, PhysicsCheckError, OSError) as error:
         print(f"articulate-ssl predict: {error}", file=sys.stderr)
         return BAD_INPUT
-    _print_summary(out, files, module.orientation)
     return 0
 
 
-def _predict(args: argparse.Namespace, out: Path) -> tuple[CloudPredictor, list[Path]]:
-    """The module that predicted, and the files written."""
+def _predict(args: argparse.Namespace) -> tuple[list[ScanPrediction], bool]:
+    """What every set of weights that is asked says, best first; whether the best knows upright cameras only."""
     # Imported here: the network takes long to import, and --help needs none of it.
-    from articulate_ssl.training.checkpoint import load_module
+    from articulate_ssl.pretrained.estimator import load
+    from articulate_ssl.pretrained.ranking import ranked
 
     cloud = load_point_cloud(args.cloud)
-    module: CloudPredictor = load_module(args.ckpt).to(args.device).eval()
-    prediction, center, scale, points = module.predict_cloud(cloud, refine=args.refine)
-    result = in_scan_frame(
-        prediction, points, center, scale, cloud, module.state_range, module.category, str(args.ckpt)
+    estimator = load(args.category or args.ckpt, None if args.view == AUTO else args.view, args.device)
+    several = len(estimator.estimators) > 1
+    progress = track(
+        estimator.estimators, "trying weights", console=Console(stderr=True), disable=not several, transient=True
     )
-    return module, write_prediction(result, out)
+    limited, found = {}, []
+    for one in progress:
+        found.append(one.predict(cloud, args.refine))
+        limited[one.weights] = one.module.orientation.limited
+    candidates = ranked(found)
+    return candidates, limited[candidates[0].checkpoint]
 
 
-def _print_summary(out: Path, files: list[Path], orientation: OrientationRange) -> None:
-    summary = json.loads((out / "prediction.json").read_text())
+def _write(result: ScanPrediction, out: Path, args: argparse.Namespace) -> list[Path]:
+    files = result.export(out, args.formats)
+    if args.html:
+        from articulate_ssl.inference.viewer import html_page
+
+        files += html_page.write(result, out)
+    return files
+
+
+def _print_check(out: Path) -> None:
+    from articulate_ssl.inference.export import physics_check
+
+    print(*physics_check.check(out).lines(), sep="\n")
+
+
+def _print_summary(candidates: list[ScanPrediction], files: list[Path], limited: bool) -> None:
+    best = candidates[0]
+    summary = best.to_dict()
+    console = Console()
+    if len(candidates) > 1:
+        _print_choice(candidates, console)
     for table in (_parts_table(summary), _joints_table(summary)):
-        Console().print(table)
-    if orientation.limited:
+        console.print(table)
+    if limited:
         print("trained on views of an upright camera: the scan is taken to have its axes (x right, y down, z forward)")
+    if best.probability is not None:
+        print(f"probability that orientation and parts are right: {best.probability:.0%}")
+    if best.unlike is not None and len(candidates) == 1:
+        print(f"{best.unlike:.0%} of the training clouds are explained better than this scan")
     print(f"reconstruction error {summary['reconstruction_error']:.4g} (in the unit of the scan)")
     print("wrote", *files, sep="\n  ")
+
+
+def _print_choice(candidates: list[ScanPrediction], console: Console) -> None:
+    """Which weights were tried, what each makes of the scan, and how sure the choice of a category is."""
+    from articulate_ssl.pretrained.ranking import how_sure
+
+    table = Table("category", "view", title="weights that were tried, best first")
+    for column in ("training clouds explained better", "probability", "error / size"):
+        table.add_column(column, justify="right")
+    for candidate in candidates:
+        category, _, view = candidate.checkpoint.rpartition("-")
+        shares = ("-" if share is None else f"{share:.0%}" for share in (candidate.unlike, candidate.probability))
+        table.add_row(category, view, *shares, f"{candidate.relative_error:.3f}")
+    console.print(table)
+    if len({candidate.category for candidate in candidates}) > 1:
+        print(how_sure(candidates))
+
+
+def _formats(text: str) -> list[str]:
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    try:
+        exporters_named(names)
+    except ExportError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+    return names
 
 
 def _device(name: str) -> torch.device:

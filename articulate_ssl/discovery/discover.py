@@ -36,6 +36,7 @@ from articulate_ssl.discovery.selection import select
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.screw import PRISMATIC
 from articulate_ssl.geometry.se3 import se3
+from articulate_ssl.ops.progress import Stage, announce
 from articulate_ssl.shape.observation import Observation
 
 log = logging.getLogger(__name__)
@@ -71,7 +72,8 @@ def discover(
     few = clouds[:: max(1, len(clouds) // options.search_clouds)][: options.search_clouds]
     references = clouds[choose_references(clouds, options.references)]
     aligned = (
-        aligned_to(one, few, rotations, options) if frame is None else alike(one, few, options) for one in references
+        aligned_to(one, few, rotations, options) if frame is None else alike(one, few, options)
+        for one in _announced(references, options)
     )
     scenes = (
         Scene(one, others, num_parts, joint_type, options, observation, generator, frame is not None)
@@ -80,15 +82,17 @@ def discover(
     found = _rounds(_best_reference(scenes, few, registrar, num_parts), clouds, few, registrar)
     if len(found.error) < len(clouds):
         found = registrar.register(found, clouds)
+    _announce(_stages(options), options, "done")
     return found if frame is None else replace(found, base=se3(frame.mT, frame.new_zeros(3)) @ found.base)
 
 
 def _best_reference(scenes: Iterator[Scene], few: Tensor, registrar: Registrar, num_parts: int) -> RegisteredShape:
     """Of the typical clouds, split and jointed, the one that explains `few` clouds best."""
     options, candidates = registrar.options, []
-    for scene in scenes:
+    for number, scene in enumerate(scenes, start=1):
         found = split(scene)
         if found is not None:
+            _announce(2 * number - 1, options, f"template {number} of {options.references}, registration")
             candidates.append(registrar.register(found, few))
             log.info("template of %d: error %.4f", len(candidates), _error(candidates[-1], options))
     if not candidates:
@@ -105,6 +109,7 @@ def split(scene: Scene) -> RegisteredShape | None:
     None if in every split a part is lost or does not move.
     """
     splits = [one for propose in load_proposals(scene.options.proposals) for one in propose(scene)]
+    log.info("joints of %d splits", len(splits))
     # Who proposes how pieces move, too, has seen more than free registration of the pieces would.
     jointed = [one.registered for one in splits if one.registered is not None]
     if not jointed:
@@ -118,6 +123,7 @@ def _rounds(found: RegisteredShape, clouds: Tensor, few: Tensor, registrar: Regi
     """Descend on the clouds that fit, register again; the last time to all clouds."""
     options = registrar.options
     for step in range(options.rounds):
+        _announce(2 * options.references + step, options, f"round {step + 1} of {options.rounds}")
         kept = found.error.argsort()[: options.kept(len(few))]
         fit = found.fit(registrar.generator, kept)
         fit.optimise(few[kept], options.cycles, keep=options.keep)
@@ -137,3 +143,19 @@ def _found(fit: InstanceFit, clouds: Tensor) -> RegisteredShape:
 
 def _error(found: RegisteredShape, options: DiscoveryOptions) -> float:
     return trimmed_mean(found.error, options.kept(len(found.error)))
+
+
+def _stages(options: DiscoveryOptions) -> int:
+    """Of roughly the same length, where a smoke run was measured: two for every template, one for every round."""
+    return 2 * options.references + options.rounds
+
+
+def _announce(done: int, options: DiscoveryOptions, name: str) -> None:
+    announce(log, Stage("part discovery", name, done, _stages(options)))
+
+
+def _announced(references: Tensor, options: DiscoveryOptions) -> Iterator[Tensor]:
+    """The typical clouds, one after the other."""
+    for number, one in enumerate(references):
+        _announce(2 * number, options, f"template {number + 1} of {options.references}")
+        yield one

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import torch
 from torch import Tensor
 
@@ -10,6 +12,8 @@ from articulate_ssl.discovery.instance_fit import InstanceFit
 from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.discovery.registered_shape import trimmed_mean
 from articulate_ssl.geometry.screw import REVOLUTE
+
+log = logging.getLogger(__name__)
 
 # Chosen by hand, not measured: the longer the descent, the fewer fits it can be paid for.
 _AFTER_SHORT_DESCENT, _AFTER_MEDIUM_DESCENT = 8, 3
@@ -29,6 +33,7 @@ def select(fits: list[InstanceFit], clouds: Tensor, options: DiscoveryOptions) -
 
 def descended(fits: list[InstanceFit], clouds: Tensor, cycles: int, options: DiscoveryOptions) -> list[InstanceFit]:
     """Those whose parts are all there and still move after a descent, best first."""
+    log.info("descent on %d splits", len(fits))
     for fit in fits:
         fit.optimise(clouds, cycles, keep=options.keep)
     moving = [fit for fit in fits if fit.shape.smallest_share >= options.min_share and least_motion(fit) > _STILL]

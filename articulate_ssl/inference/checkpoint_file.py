@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import pickle
 import warnings
+import zipfile
 from pathlib import Path
 from typing import Any
 
 import torch
 
 CHECKPOINT_KEY = "articulate_ssl"
+SUFFIX = ".ckpt"
 
 
 class CheckpointError(ValueError):
@@ -27,8 +29,7 @@ def read_checkpoint(path: str | os.PathLike) -> dict[str, Any]:
         CheckpointError: naming the file, what is wrong with it and what to do.
     """
     path = Path(path)
-    if not path.is_file():
-        raise CheckpointError(f"{path}: no such checkpoint; train one with `lightning fit -c configs/<category>.yaml`")
+    _check_file(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about foreign pickles, whose refusal below says all there is to say
@@ -38,7 +39,7 @@ def read_checkpoint(path: str | os.PathLike) -> dict[str, Any]:
             f"{path}: damaged, or with pickled objects, which are not read because they can run code; "
             "use a .ckpt file that `lightning fit` wrote"
         ) from error
-    except (RuntimeError, EOFError, OSError, ValueError, KeyError, AttributeError) as error:
+    except (RuntimeError, EOFError, OSError, ValueError, LookupError, AttributeError) as error:
         raise CheckpointError(
             f"{path}: damaged or cut off, cannot be read; copy it again or use another .ckpt file of the same run"
         ) from error
@@ -50,3 +51,23 @@ def read_checkpoint(path: str | os.PathLike) -> dict[str, Any]:
             "use a .ckpt file that `lightning fit` wrote"
         )
     return content
+
+
+def _check_file(path: Path) -> None:
+    """Refuse what cannot be a checkpoint, whatever it holds."""
+    if path.is_dir():
+        raise CheckpointError(f"{path}: a folder, not a checkpoint; {_in_folder(path)}")
+    if not path.exists():
+        raise CheckpointError(f"{path}: no such checkpoint; train one with `lightning fit -c configs/<category>.yaml`")
+    if path.suffix != SUFFIX:
+        raise CheckpointError(f"{path}: not a {SUFFIX} file; use one that `lightning fit` wrote")
+    # What has no table of contents at its end would go to a reader of older formats, which fails in any way it likes.
+    if not zipfile.is_zipfile(path):
+        raise CheckpointError(
+            f"{path}: damaged, cut off, or no checkpoint at all; copy it again or use another .ckpt file of its run"
+        )
+
+
+def _in_folder(folder: Path) -> str:
+    found = max(folder.rglob(f"*{SUFFIX}"), key=lambda path: path.stat().st_mtime, default=None)
+    return f"the newest one in it is {found}" if found else f"name a {SUFFIX} file that `lightning fit` wrote"

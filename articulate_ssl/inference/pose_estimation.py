@@ -23,8 +23,9 @@ from torch import Tensor
 
 from articulate_ssl.discovery.registration import register_articulated
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
+from articulate_ssl.inference.confidence import relative_error
 from articulate_ssl.inference.point_cloud_io import normalise_cloud
-from articulate_ssl.inference.prediction import Prediction
+from articulate_ssl.inference.prediction import Prediction, ScanEstimate
 from articulate_ssl.losses.reconstruction import distances_to_parts
 from articulate_ssl.network.articulated_network import ArticulatedNetwork
 from articulate_ssl.network.hypotheses import Hypotheses
@@ -59,17 +60,21 @@ class InferenceOptions:
     fine_scale: float = 0.02
 
 
-def margins(
+def rivals(
     error: Tensor,  # [B, C] of the hypotheses
     base: Tensor,  # [B, C, 4, 4]
     chosen: Tensor,  # [B]
-) -> Tensor:  # [B]
-    """`Prediction.margin` of chosen hypotheses: how much worse the best one is that is turned another way."""
+    allowed: Tensor,  # [B, C] bool, which ones may be rivals
+) -> tuple[Tensor, Tensor]:  # [B], [B]
+    """Rivals of chosen hypotheses, the best ones that are turned another way, and `Prediction.margin`.
+
+    Where none is turned another way, the chosen one is its own rival, and the margin 1.
+    """
     rows = torch.arange(len(chosen), device=chosen.device)
     rotation = base[..., :3, :3]
     angle = roma.rotmat_geodesic_distance(rotation, rotation[rows, chosen, None].expand_as(rotation))
-    rival = error.masked_fill(angle < _ANOTHER_WAY, torch.inf).amin(dim=1)
-    return (1 - error[rows, chosen] / rival).clamp(0, 1)
+    least, rival = error.masked_fill(~allowed | (angle < _ANOTHER_WAY), torch.inf).min(dim=1)
+    return torch.where(least.isinf(), chosen, rival), (1 - error[rows, chosen] / least).clamp(0, 1)
 
 
 @dataclass(frozen=True)
@@ -193,17 +198,35 @@ class PoseEstimator:
         Raises:
             ValueError: if a cloud has NaN or infinite points.
         """
+        return self.predict_with_rivals(points, num_points, refine)[0]
+
+    @torch.no_grad()
+    def predict_with_rivals(
+        self,
+        points: Tensor,  # [B, N, 3] normalised, farthest-point order
+        num_points: int,
+        refine: bool | None = None,
+    ) -> tuple[Prediction, Prediction]:
+        """`predict`, and of every cloud the best hypothesis that is turned another way (the same, if none is).
+
+        Raises:
+            ValueError: if a cloud has NaN or infinite points.
+        """
         if not torch.isfinite(points).all():
             raise ValueError("a cloud has NaN or infinite points")
         with torch.autocast(points.device.type, enabled=False):
             aligned, pose = self.align(points[:, :num_points])
             *_, last = self.iterate(aligned)
             if self.inference.refine if refine is None else refine:
-                chosen, margin = self._refine(last, transform_points(invert_se3(pose), points))
+                candidates, error = self._refine(last, transform_points(invert_se3(pose), points))
             else:
-                chosen = last.hypotheses.select(last.winner)
-                margin = margins(last.distance, last.hypotheses.base, last.winner)
-            return self._prediction(chosen.at(pose[:, None] @ chosen.base, chosen.state), points, margin)
+                candidates, error = last.hypotheses, last.distance
+            candidates = candidates.at(pose[:, None] @ candidates.base, candidates.state)
+            rotation = candidates.base[..., :3, :3]
+            best = self.observation.ranked(error, rotation).argmin(dim=1)
+            rival, margin = rivals(error, candidates.base, best, self.observation.orientation.contains(rotation))
+            chosen = self._prediction(candidates.select(best), points, margin)
+            return chosen, self._prediction(candidates.select(rival), points, torch.zeros_like(margin))
 
     def predict_scan(
         self,
@@ -211,16 +234,13 @@ class PoseEstimator:
         num_points: int,
         radius: tuple[float, float],
         refine: bool | None = None,
-    ) -> tuple[Prediction, np.ndarray, float, np.ndarray]:
+    ) -> ScanEstimate:
         """Predict a scan of unknown scale: of several within the training clouds' range, the best reconstruction wins.
 
         Args:
             num_points: See `predict`; registration reads as many as the options say.
             radius: Mean and standard deviation, over normalised training clouds, of the points' mean distance to their
                 centre.
-
-        Returns:
-            The prediction (B = 1), centre [3] and scale of the normalisation, and the normalised points it labels.
         """
         cloud, center, _ = normalise_cloud(points, max(num_points, self.inference.points), scale=1.0)
         mean, spread = radius
@@ -228,22 +248,20 @@ class PoseEstimator:
         scales = [size / (mean + shift * spread) for shift in _SCALE_STARTS]
         device = self.articulated.category.template.device
         batch = torch.stack([torch.as_tensor(cloud / scale, dtype=torch.float32) for scale in scales]).to(device)
-        prediction = self.predict(batch, num_points, refine)
-        extent = batch.norm(dim=-1).mean(dim=-1)
-        best = int((prediction.reconstruction_error / extent).argmin())
-        return prediction[best : best + 1], center, scales[best], batch[best].cpu().numpy()
+        prediction, rival = self.predict_with_rivals(batch, num_points, refine)
+        best = int(relative_error(prediction, batch).argmin())
+        one = slice(best, best + 1)
+        rival = rival[one] if prediction.margin[best] < 1 else None
+        return ScanEstimate(prediction[one], rival, batch[best].cpu().numpy(), center, scales[best])
 
     def _refine(self, last: Iteration, points: Tensor) -> tuple[Hypotheses, Tensor]:
-        """The best of the leading hypotheses after articulated registration of the predicted shape, and its margin."""
+        """The leading hypotheses after articulated registration of the predicted shape, and their errors."""
         options, hypotheses = self.inference, last.hypotheses
         count = min(options.candidates, hypotheses.base.shape[1])
         candidates = hypotheses.select(last.leading(count))
         scales = options.coarse_scale, options.fine_scale
         base, state, error = self.register(candidates, points, scales, options.rounds)
-        best = self.observation.ranked(error, base[..., :3, :3]).argmin(dim=1)
-        rows = torch.arange(len(points), device=points.device)
-        chosen = candidates.select(best).at(base[rows, best][:, None], state[rows, best][:, None])
-        return chosen, margins(error, base, best)
+        return candidates.at(base, state), error
 
     def _prediction(self, chosen: Hypotheses, points: Tensor, margin: Tensor) -> Prediction:
         """Package one hypothesis per cloud."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+import numpy as np
 from torch import Tensor
 
 
@@ -63,3 +64,26 @@ class Prediction:
     def to(self, device) -> Prediction:
         """Every field on `device`."""
         return Prediction(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
+
+@dataclass(frozen=True)
+class ScanEstimate:
+    """What is predicted for one scan of unknown scale; (scan - center) / scale is what was read.
+
+    Attributes:
+        prediction: B = 1, normalised units.
+        rival: The best hypothesis that is turned another way, B = 1; None if none was considered.
+        points: [N, 3] the normalised points that both label.
+        center: [3], in the frame of the scan.
+        scale: Units of the scan per normalised unit.
+        probability: That orientation and parts are right; None if that has not been learnt (`inference.confidence`).
+        unlike: Share of the training clouds that were explained better; None likewise.
+    """
+
+    prediction: Prediction
+    rival: Prediction | None
+    points: np.ndarray
+    center: np.ndarray
+    scale: float
+    probability: float | None = None
+    unlike: float | None = None

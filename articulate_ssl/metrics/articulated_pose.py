@@ -187,15 +187,17 @@ class ArticulatedPoseMetrics(Metric):
         self.replicates = replicates
         self.seed = seed
         measured = [name for name in (*PER_PART, *PER_JOINT, *PER_CLOUD) if name not in AT_THE_END]
-        for name in ("instance", "relative_rotation", *(f"rest_{name}" for name in REST), "margin", *measured):
+        said = ("margin", "probability")
+        for name in ("instance", "relative_rotation", *(f"rest_{name}" for name in REST), *said, *measured):
             self.add_state(name, default=[], dist_reduce_fx="cat")
 
-    def update(self, prediction: Prediction, labels: dict[str, Tensor]) -> None:
+    def update(self, prediction: Prediction, labels: dict[str, Tensor], probability: Tensor | None = None) -> None:
         """Add the clouds of a batch; every one counts.
 
         Args:
             prediction: B clouds.
             labels: shard arrays of the same clouds; `points` [B, N, 3] are the clouds the network saw.
+            probability: [B] that the predictions are right, if the method says so; of all clouds or of none.
 
         Raises:
             ValueError: if the labels do not belong to the prediction.
@@ -208,6 +210,8 @@ class ArticulatedPoseMetrics(Metric):
             getattr(self, f"rest_{name}").append(values)
         self.instance.append(labels["instance"].long())
         self.margin.append(prediction.margin.double())
+        if probability is not None:
+            self.probability.append(probability.double())
 
     def compute(self) -> dict:
         """Statistics of everything seen.
@@ -218,8 +222,8 @@ class ArticulatedPoseMetrics(Metric):
             three for every single part or joint in the lists `parts` or `joints`. `flip_rate` and `above_30_rate` have
             a cloud count if any part does. Values that do not exist (the pivot of a prismatic joint) are None. Beside
             them `samples`, `failures` (0: no cloud is ever dropped), `instances`, `symmetric_instances`, those of
-            them with a symmetry besides the identity (`metrics/symmetry.py`), and `margin`, what `Prediction.margin` is
-            worth as a confidence (`metrics/confidence.py`).
+            them with a symmetry besides the identity (`metrics/symmetry.py`), and what `margin` and `probability` (None
+            if the method has none) are worth as a confidence (`metrics/confidence.py`).
 
         Raises:
             ValueError: if nothing was added.
@@ -240,8 +244,10 @@ class ArticulatedPoseMetrics(Metric):
             result[name] = self._summary(average, instance)
             single = "parts" if name in PER_PART else "joints"
             result[name][single] = [self._summary(column, instance) for column in values.unbind(1)]
-        confidence = report_confidence(dim_zero_cat(self.margin), dim_zero_cat(self.r_err_deg))
-        return result | {"samples": len(instance), "failures": 0} | counts | {"margin": confidence}
+        said = {name: getattr(self, name) for name in ("margin", "probability")}
+        errors = dim_zero_cat(self.r_err_deg)
+        confidence = {k: report_confidence(dim_zero_cat(v), errors) if len(v) else None for k, v in said.items()}
+        return result | {"samples": len(instance), "failures": 0} | counts | confidence
 
     def _modulo_symmetry(self, instance: Tensor) -> tuple[dict[str, Tensor], dict[str, int]]:
         """`AT_THE_END`, every one [S, K], and how many instances there are and are symmetric."""

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
-from dataclasses import asdict, is_dataclass
+from dataclasses import asdict, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from lightning.pytorch import LightningModule
+from lightning.pytorch import Callback, LightningModule
 from torch import Tensor
 from torch.nn.functional import one_hot
 
@@ -18,25 +19,32 @@ from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.geometry.orientation_range import OrientationRange
 from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE
 from articulate_ssl.inference.checkpoint_file import CHECKPOINT_KEY
+from articulate_ssl.inference.confidence import Confidence, relative_error
 from articulate_ssl.inference.pose_estimation import InferenceOptions, PoseEstimator
-from articulate_ssl.inference.prediction import Prediction
+from articulate_ssl.inference.prediction import Prediction, ScanEstimate
 from articulate_ssl.losses.objective import ObjectiveOptions, rigid_loss
 from articulate_ssl.network.articulated_network import ArticulatedNetwork
 from articulate_ssl.network.options import NetworkOptions
 from articulate_ssl.network.rigid_alignment import RigidAlignment
+from articulate_ssl.ops.progress import announced
 from articulate_ssl.shape.observation import Observation
+from articulate_ssl.training.hub import HubWeights
+from articulate_ssl.training.label_free_report import LabelFreeReport
 from articulate_ssl.training.recipes import recipe_class
 from articulate_ssl.training.recipes.recipe import Outcome
 from articulate_ssl.training.running_statistics import RadiusStatistics, StateRange
 from articulate_ssl.training.schedule import ScheduleOptions
+from articulate_ssl.training.self_agreement import LearnConfidence, look_twice
 from articulate_ssl.training.test_report import TestReport
 from datamodules.articulated_dataset import split_labels
+
+log = logging.getLogger(__name__)
 
 JOINT_TYPES = {"revolute": REVOLUTE, "prismatic": PRISMATIC}
 _CONFIDENCE_WEIGHT = 0.02  # of a batch in the running mean of adjacency confidences, once fifty are seen
 
 
-class ArticulatedPoseModule(LightningModule):
+class ArticulatedPoseModule(LightningModule, HubWeights):
     """Self-supervised category-level articulated object pose estimation.
 
     Args:
@@ -50,7 +58,8 @@ class ArticulatedPoseModule(LightningModule):
         schedule: Steps and learning rates.
         discovery: Effort of part discovery (staged recipe).
         inference: Refinement at test time.
-        calibration_samples: Training clouds on which `lightning test` relates slots and canonical spaces to labels.
+        calibration_samples: Training clouds on which `lightning test` relates slots and canonical spaces to labels, and
+            from which confidence is learnt without them.
         orientation_range: How far objects are turned from their mean orientation at most, in degrees; 180 stands for
             any orientation, less where a camera is held upright.
 
@@ -92,6 +101,7 @@ class ArticulatedPoseModule(LightningModule):
         self.recipe = recipe_class(recipe)(self.estimator, objective, schedule, discovery)
         self.radius = RadiusStatistics()
         self.states = StateRange(num_parts - 1)
+        self.confidence = Confidence()
         self.num_points = 512  # of a training cloud; a scan is thinned to as many
 
     @property
@@ -114,12 +124,37 @@ class ArticulatedPoseModule(LightningModule):
         self,
         points: np.ndarray,  # [N, 3] any unit and origin
         refine: bool | None = None,
-    ) -> tuple[Prediction, np.ndarray, float, np.ndarray]:
+    ) -> ScanEstimate:
         """Predict a scan of unknown scale: see `PoseEstimator.predict_scan`."""
         radius = float(self.radius.mean), float(self.radius.spread)
-        return self.estimator.predict_scan(points, self.num_points, radius, refine)
+        estimate = self.estimator.predict_scan(points, self.num_points, radius, refine)
+        if not self.confidence.learnt:
+            return estimate
+        probability, unlike = self.confidence_of(estimate.prediction, torch.from_numpy(estimate.points)[None])
+        return replace(estimate, probability=float(probability), unlike=float(unlike))
+
+    def confidence_of(
+        self,
+        prediction: Prediction,
+        points: Tensor,  # [B, N, 3] that were predicted
+    ) -> tuple[Tensor, Tensor]:  # [B], [B]
+        """Probability that predictions are right, and share of the training clouds that were explained better."""
+        error = relative_error(prediction, points.to(prediction.margin))
+        return self.confidence.probability(prediction.margin, error), self.confidence.unlike(error)
+
+    def learn_confidence(self) -> None:
+        """Learn from training clouds how far predictions can be trusted (`inference.confidence`)."""
+        training = self.training
+        self.eval()
+        clouds = self._training_clouds(self.calibration_samples).to(self.device)
+        self.confidence.learn(*look_twice(self, clouds))
+        self.train(training)
 
     # Training
+
+    def configure_callbacks(self) -> list[Callback]:
+        """Confidence is learnt with the last step."""
+        return [LearnConfidence()]
 
     def configure_optimizers(self) -> dict[str, Any]:
         """Adam; the category's shapes and joints are a group of their own."""
@@ -213,10 +248,14 @@ class ArticulatedPoseModule(LightningModule):
         self.log("val_reconstruction", error, prog_bar=True, batch_size=len(points), sync_dist=True)
 
     def on_test_start(self) -> None:
-        """Relate slots and canonical spaces to the labelled ones, on training clouds."""
+        """Relate slots and canonical spaces to the labelled ones, on training clouds; without labels, nothing."""
+        if not self.trainer.datamodule.manifest.labelled:
+            self.test_report = LabelFreeReport(self.predict_points, self.orientation.limited).to(self.device)
+            return
         loader = self.trainer.datamodule.calibration_dataloader(self.calibration_samples)
         batches = [self._whole(self.transfer_batch_to_device(batch, self.device, 0)) for batch in loader]
-        predictions = [self.predict_points(split_labels(batch)[0]["points"]) for batch in batches]
+        shown = announced(log, "calibration on training clouds", batches)
+        predictions = [self.predict_points(split_labels(batch)[0]["points"]) for batch in shown]
         self.test_report = TestReport(predictions, batches).to(self.device)
 
     def test_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
@@ -224,7 +263,10 @@ class ArticulatedPoseModule(LightningModule):
         batch = self._whole(batch)
         start = time.perf_counter()
         prediction = self.predict_points(split_labels(batch)[0]["points"])
-        self.test_report.update(prediction, batch, time.perf_counter() - start)
+        seconds = time.perf_counter() - start
+        known = self.confidence.learnt
+        probability = self.confidence_of(prediction, batch["points"])[0] if known else None
+        self.test_report.update(prediction, batch, seconds, probability)
 
     def _whole(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """The batch with as many points as registration reads; the networks still see those that they would."""

@@ -48,9 +48,15 @@ class TestReport:
         self.metrics.to(device)
         return self
 
-    def update(self, prediction: Prediction, batch: dict[str, Tensor], seconds: float) -> None:
+    def update(
+        self,
+        prediction: Prediction,
+        batch: dict[str, Tensor],
+        seconds: float,
+        probability: Tensor | None,  # [B] that it is right, if that has been learnt
+    ) -> None:
         """Add a batch of test clouds that took `seconds` to predict."""
-        self.metrics.update(prediction, batch)
+        self.metrics.update(prediction, batch, probability)
         self.seconds += seconds
         nearest = torch.cdist(batch["points"], batch["dense_points"]).argmin(dim=-1)
         self.samples.append(

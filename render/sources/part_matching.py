@@ -67,6 +67,11 @@ def to_category(
 
 def require_rules(spec: CategorySpec, source: str) -> None:
     """Raise ValueError if a category with parts of its own does not say how to find them in a source."""
+    if spec.parts and spec.recognition is None:
+        raise ValueError(
+            f"category {spec.name!r} does not say how to find its parts in source {source!r}: its file lacks "
+            "`recognition`, see render/categories/laptop.yaml"
+        )
     if spec.parts and source not in spec.recognition.sources:
         known = ", ".join(spec.recognition.sources)
         raise ValueError(f"source {source!r} has no objects of category {spec.name!r}; it can be read from {known}")

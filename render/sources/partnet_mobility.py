@@ -39,12 +39,13 @@ class PartNetMobilitySource(Source):
         """Ids of all instances, sorted.
 
         Objects of another `model_cat` belong to other categories. Of the category's, those with another number of its
-        parts (a safe with two doors) are other things and are left out.
+        parts (a safe with two doors) are other things and are left out. An object that cannot be read is taken for an
+        instance: `load` says what is wrong with it.
 
         Raises:
             ValueError: if no object is left.
         """
-        ids, _ = self._selection
+        ids = self._selection[0]
         if not ids:
             groups = joint_groups(self.spec, SOURCE)
             wanted = " and ".join(f"{len(joints)} part(s) labelled {label!r}" for (_, label), joints in groups.items())
@@ -65,19 +66,31 @@ class PartNetMobilitySource(Source):
         Raises:
             ValueError: naming the file, what is wrong with it and what to do.
         """
+        if problem := self._selection[2].get(instance_id):
+            raise ValueError(problem)
         folder = self.folders[instance_id]
         labels = {link: label for link, _, label in read_semantics(folder / "semantics.txt")}
         graph = read_urdf(folder / "mobility.urdf", folder, below_root=True).labelled(labels)
         return to_category(graph, self.spec, SOURCE, instance_id, front_known=True)
 
     @cached_property
-    def _selection(self) -> tuple[list[str], dict[str, str]]:
-        """Ids of the instances, and why the other objects of the category's `model_cat` are none."""
+    def _selection(self) -> tuple[list[str], dict[str, str], dict[str, str]]:
+        """Ids of instances, why other objects of the category's `model_cat` are none, and what cannot be read."""
         if not self.spec.parts:
-            return list(self.folders), {}
-        of_category = {i: folder for i, folder in self.folders.items() if self._is_of_category(folder)}
-        mismatches = {i: self._mismatch(folder) for i, folder in of_category.items()}
-        return [i for i, reason in mismatches.items() if not reason], {i: r for i, r in mismatches.items() if r}
+            return list(self.folders), {}, {}
+        ids, mismatches, problems = [], {}, {}
+        for instance_id, folder in self.folders.items():
+            try:
+                if not self._is_of_category(folder):
+                    continue
+                mismatch = self._mismatch(folder)
+            except ValueError as error:
+                mismatch, problems[instance_id] = "", str(error)
+            if mismatch:
+                mismatches[instance_id] = mismatch
+            else:
+                ids.append(instance_id)
+        return ids, mismatches, problems
 
     def _is_of_category(self, folder: Path) -> bool:
         meta = folder / "meta.json"

@@ -12,6 +12,7 @@ import torch
 from lightning.pytorch import LightningModule, Trainer
 from synthetic import write_synthetic_set
 from torch.utils.data import DistributedSampler
+from unlabelled import without_labels
 
 from datamodules.articulated_data_module import ArticulatedDataModule
 from datamodules.manifest import ManifestError
@@ -211,7 +212,7 @@ def test_ranks_share_one_training_stream_and_test_every_sample_once(tmp_path, sy
         ({"view": "partial"}, "make data CAT=oven VIEW=partial PROTOCOL=honest OUT=ROOT"),
         (
             {"view": "partial", "protocol": "eap", "source": "hoi4d"},
-            "make data CAT=oven VIEW=partial PROTOCOL=eap SOURCE=hoi4d OUT=ROOT",
+            "make data CAT=oven VIEW=partial PROTOCOL=eap SOURCE=hoi4d ROOT=path/to/it OUT=ROOT",
         ),
     ],
 )
@@ -220,7 +221,7 @@ def test_a_missing_set_is_named_with_the_command_that_makes_it(tmp_path, options
     with pytest.raises(ManifestError) as error:
         module.setup("fit")
     assert str(module.folder) in str(error.value)
-    assert str(error.value).endswith(command.replace("ROOT", str(tmp_path)))
+    assert str(error.value).endswith(command.replace("OUT=ROOT", f"OUT={tmp_path}"))
 
 
 def test_a_set_of_another_category_is_refused(tmp_path, synthetic_set):
@@ -241,3 +242,9 @@ def test_a_set_of_another_category_is_refused(tmp_path, synthetic_set):
 def test_senseless_arguments_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         ArticulatedDataModule("laptop", **options)
+
+
+def test_metrics_cannot_be_calibrated_on_a_set_without_labels(tmp_path, synthetic_set):
+    without_labels(synthetic_set)
+    with pytest.raises(ManifestError, match=r"has no labels.*--data\.calibration_set"):
+        data(tmp_path).calibration_dataloader()

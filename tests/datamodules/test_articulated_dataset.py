@@ -9,6 +9,7 @@ import pytest
 import torch
 from synthetic import write_synthetic_set
 from torch.testing import assert_close
+from unlabelled import without_labels
 
 from articulate_ssl.geometry.screw import PRISMATIC, screw_motion
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
@@ -171,3 +172,20 @@ def test_a_subset_has_the_size_asked_for_even_over_unequal_instances(size, expec
     instance = np.array([0] * 2 + [1] * 9 + [4])
     subset = spread_subset(instance, size)
     assert len(np.unique(subset)) == len(subset) == expected
+
+
+def test_without_labels_the_clouds_are_the_same_and_the_labels_are_gone(tmp_path):
+    labelled, bare = write_synthetic_set(tmp_path / "a"), without_labels(write_synthetic_set(tmp_path / "b"))
+    keys = [(3, 100), (9, 101)]
+    options = {"num_points": 32, "rotate": True, "noise_std": 0.1, "seed": 4}
+    with_labels, without = (ArticulatedDataset(f, "train", **options).__getitems__(keys) for f in (labelled, bare))
+    assert set(without) == {"points", "dense_points", "sample", "instance", "center", "scale"}
+    for name, value in without.items():
+        assert torch.equal(value, with_labels[name]), name
+
+
+def test_shards_that_contradict_the_manifest_about_labels_are_refused(tmp_path):
+    labelled, bare = write_synthetic_set(tmp_path / "a"), without_labels(write_synthetic_set(tmp_path / "b"))
+    Manifest.load(labelled).save(bare)
+    with pytest.raises(ShardError, match="shard has no labels, the manifest says otherwise"):
+        ArticulatedDataset(bare, "train", 32, verify=False)

@@ -27,7 +27,7 @@ def test_saving_what_was_loaded_gives_the_same_bytes(synthetic_set, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"schema_version": 99}, "schema version is 99, this program reads version 2"),
+        ({"schema_version": 99}, "schema version is 99, this program reads version 3"),
         ({"schema_version": "remove"}, "schema version is None"),
         ({"seed": "remove"}, "missing fields: seed"),
         ({"mood": 1}, "unknown fields: mood"),
@@ -38,6 +38,8 @@ def test_saving_what_was_loaded_gives_the_same_bytes(synthetic_set, tmp_path):
         ({"rest_state": {}}, "rest_state"),
         ({"left_out": {"train-0": "broken"}}, "'train-0' is both in a split and left out"),
         ({"left_out": ["a"]}, "damaged"),
+        ({"split_by": "mood"}, "split_by is 'mood'"),
+        ({"scans": {"train": []}}, "scans names the splits"),
         ({"joint_types": [0, 0]}, "2 entries"),
         ({"joint_types": ["hinge"]}, "joint_types are"),
         ({"shards": {"train": [{"name": "a", "samples": 0, "sha256": ""}], "test": []}}, "a shard has no samples"),
@@ -62,6 +64,26 @@ def test_version_1_did_not_record_what_is_left_out(synthetic_set):
     manifest = Manifest.load(synthetic_set)
     edit(synthetic_set, schema_version=1, left_out="remove")
     assert Manifest.load(synthetic_set) == manifest
+
+
+def test_version_2_knew_labelled_sets_only(synthetic_set):
+    manifest = Manifest.load(synthetic_set)
+    edit(synthetic_set, schema_version=2, labelled="remove", split_by="remove", scans="remove")
+    assert Manifest.load(synthetic_set) == manifest and manifest.labelled
+
+
+def test_a_set_without_labels_needs_no_rest_states_and_may_split_one_object(synthetic_set, tmp_path):
+    manifest = Manifest.load(synthetic_set)
+    unlabelled = dataclasses.replace(
+        manifest, labelled=False, rest_state={}, articulation_range=(), split_by="scan",
+        instances={"train": ("chair",), "test": ("chair",)}, scans={"train": ("chair/a.ply",), "test": ("chair/b.ply",)}
+    )  # fmt: skip
+    unlabelled.save(tmp_path)
+    assert Manifest.load(tmp_path) == unlabelled
+    with pytest.raises(ValueError, match="twice"):
+        dataclasses.replace(unlabelled, split_by="instance")
+    with pytest.raises(ValueError, match="rest_state"):
+        dataclasses.replace(unlabelled, labelled=True)
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"schema_version": NaN}'])

@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 from synthetic import synthetic_arrays
 
-from datamodules.shards import ALIGNMENT, SHARD_ARRAYS, ShardError, read_shard, sha256_of, write_shard
+from datamodules.shards import (
+    ALIGNMENT,
+    SHARD_ARRAYS,
+    UNLABELLED_ARRAYS,
+    ShardError,
+    read_shard,
+    sha256_of,
+    write_shard,
+)
 
 
 @pytest.fixture
@@ -159,3 +167,13 @@ def test_a_failing_write_keeps_the_old_file_and_leaves_no_other(tmp_path, arrays
     with pytest.raises(OSError, match="No space left"):
         write_shard(path, arrays | {"scale": arrays["scale"] * 2})
     assert [sha256_of(p) for p in tmp_path.iterdir()] == [sha256]
+
+
+def test_a_shard_has_all_labels_or_none(tmp_path, arrays):
+    unlabelled = {name: arrays[name] for name in UNLABELLED_ARRAYS}
+    sha256 = write_shard(tmp_path / "a.npz", unlabelled)
+    assert tuple(read_shard(tmp_path / "a.npz", sha256)) == UNLABELLED_ARRAYS
+    with pytest.raises(ShardError, match="'part_id' is missing"):
+        write_shard(tmp_path / "b.npz", unlabelled | {"joint_axis": arrays["joint_axis"]})
+    with pytest.raises(ShardError, match="'instance' is missing"):
+        write_shard(tmp_path / "b.npz", {"points": arrays["points"]})

@@ -9,6 +9,7 @@ import shutil
 import numpy as np
 import pytest
 from synthetic import write_synthetic_set
+from unlabelled import without_labels
 
 from articulate_ssl.geometry.screw import PRISMATIC
 from datamodules.manifest import Manifest
@@ -102,3 +103,21 @@ def test_wrong_labels_under_a_right_checksum_are_named(synthetic_set, change, me
 def test_the_number_of_parts_must_be_the_manifests(synthetic_set):
     rewrite(synthetic_set, lambda a: a.update(part_pose=a["part_pose"][:, :1], part_center=a["part_center"][:, :1]))
     assert "has 1 parts and 1 joints, the manifest says 2 and 1" in verify_set(synthetic_set)[0]
+
+
+def test_sets_without_labels_are_checked_for_what_they_have(synthetic_set):
+    assert verify_set(without_labels(synthetic_set)) == []
+
+    def spoil(arrays):
+        arrays["scale"][2] = -1
+        arrays["instance"][0] = 7
+
+    rewrite(synthetic_set, spoil)
+    problems = verify_set(synthetic_set)
+    assert len(problems) == 2 and "scale is not positive" in problems[1] and "instance is outside 0..2" in problems[0]
+
+
+def test_labels_that_the_manifest_denies_are_a_problem(synthetic_set):
+    manifest = Manifest.load(synthetic_set)
+    dataclasses.replace(manifest, labelled=False, rest_state={}, articulation_range=()).save(synthetic_set)
+    assert all("has labels, the manifest says otherwise" in problem for problem in verify_set(synthetic_set))

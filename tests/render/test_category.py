@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from objects import box_laptop
 
-from render.category import category_names, load_category
+from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE
+from render.category import category_names, load_category, made_category, parse_category
 
 # parts, joints, train and test instances of design.md section 5
 CATEGORIES = {
@@ -75,3 +76,54 @@ def test_to_rest_moves_meshes_to_the_rest_state_of_the_category():
 def test_to_rest_refuses_objects_of_another_category():
     with pytest.raises(ValueError, match=r"'box' has parts.*the category has parts"):
         load_category("oven").to_rest(box_laptop())
+
+
+def test_a_users_file_needs_parts_and_joint_types_only(tmp_path):
+    (tmp_path / "mybox.yaml").write_text("parts: [box, lid, tray]\njoints: [{type: revolute}, {type: prismatic}]\n")
+    spec = load_category(str(tmp_path / "mybox.yaml"))
+    assert (spec.name, spec.parts, spec.recognition) == ("mybox", ("box", "lid", "tray"), None)
+    lid, tray = spec.joints
+    assert (lid.type, lid.parent, lid.child, lid.rest) == (REVOLUTE, 0, 1, 0)
+    assert (lid.lower, lid.upper) == (0, pytest.approx(pi / 2))
+    assert (tray.type, tray.parent, tray.child, tray.lower, tray.upper) == (PRISMATIC, 0, 2, 0, 1)
+
+
+def test_a_category_made_of_numbers_is_such_a_file():
+    spec = parse_category("thing", made_category(4, "prismatic"))
+    assert len(spec.parts) == 4
+    assert [(joint.type, joint.parent, joint.child) for joint in spec.joints] == [(PRISMATIC, 0, k) for k in (1, 2, 3)]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("parts: [box, lid]", "its file lacks joints"),
+        ("- a", "its file must be a mapping of joints, parts"),
+        ("a: [", "its file is not YAML"),
+        ("parts: [box]\njoints: []", "has 1 parts and 0 joints"),
+        ("parts: [box, lid]\njoints: []", "has 2 parts and 0 joints"),
+        ("parts: [box, box]\njoints: [{type: revolute}]", "named twice"),
+        ("parts: box\njoints: [{type: revolute}]", "parts must be a list"),
+        ("parts: [box, lid]\njoints: [{name: hinge}]", "joint 0 lacks type"),
+        ("parts: [box, lid]\njoints: [revolute]", "joint 0 must be a mapping of type"),
+        ("parts: [box, lid]\njoints: [{type: ball}]", "joint 0 has type 'ball'; there are revolute and prismatic"),
+        ("parts: [box, lid]\njoints: [{type: revolute, parent: bxo}]", "names the part 'bxo'; there are box, lid"),
+        ("parts: [box, lid]\njoints: [{type: revolute, rang_deg: [0, 9]}]", "has unknown rang_deg; known are child,"),
+        ("parts: [box, lid]\njoints: [{type: revolute, range_travel: [0, 1]}]", "it may have range_deg and rest_deg"),
+        ("parts: [box, lid]\njoints: [{type: revolute, range_deg: [9, 0]}]", r"must be \[lowest, highest\]"),
+        ("parts: [box, lid]\njoints: [{type: revolute, range_deg: [0, wide]}]", "must be a number, not 'wide'"),
+        ("parts: [box, lid]\njoints: [{type: revolute}]\nveiw: {}", "has unknown veiw"),
+        ("parts: [box, lid]\njoints: [{type: revolute}]\nview: {roll_deg: [0, 1]}", "view lacks azimuth_deg"),
+    ],
+)
+def test_an_unsound_file_says_what_is_missing_or_wrong(tmp_path, text, message):
+    (tmp_path / "mybox.yaml").write_text(text)
+    with pytest.raises(ValueError, match=f"category 'mybox': {message}|category 'mybox': .*{message}"):
+        load_category(str(tmp_path / "mybox.yaml"))
+
+
+def test_a_file_that_is_not_there_or_badly_named_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"box\.yaml: cannot be read \(No such file"):
+        load_category(str(tmp_path / "box.yaml"))
+    with pytest.raises(ValueError, match="use letters, digits"):
+        load_category(str(tmp_path / "my box.yaml"))

@@ -31,7 +31,8 @@ from datamodules.shards import read_shard, write_shard
 from datamodules.verify import verify_set
 from render.category import load_category
 from render.execution import run_tasks
-from render.generate import default_split, main
+from render.generate import main
+from render.object_set import default_split
 
 SMALL = ["--states", "3", "--rotations", "2", "--views", "2", "--points", "64", "--resolution", "64"]
 
@@ -294,7 +295,7 @@ def test_other_options_in_the_same_folder_are_refused(tmp_path, complete_set, ca
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--category", "toaster"], "invalid choice: 'toaster'"),
+        (["--category", "toaster"], "unknown category 'toaster'"),
         (["--category", "laptop", "--states", "0"], "must be at least 1"),
         (["--category", "laptop", "--states", "many"], "invalid integer value: 'many'"),
         (["--category", "laptop", "--noise-std", "-1"], "--noise-std must be in [0, 1)"),

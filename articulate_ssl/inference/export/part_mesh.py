@@ -9,6 +9,10 @@ from scipy.spatial import cKDTree
 HULL_SLACK = 2.5
 ALPHA_RADII = (1.5, 1.75, 2.0, 2.25, 2.5, 3.0, 4.0, 6.0)
 MIN_THICKNESS = 1e-3
+# Of coordinates near one: a few times what float32 numbers resolve. For points that all but coincide.
+LEAST_THICKNESS = 1e-6
+# Points that are all at the origin have no size of their own.
+SMALLEST_UNIT = 1e-12
 
 
 def part_mesh(
@@ -21,10 +25,21 @@ def part_mesh(
     its surface lies within `HULL_SLACK` point spacings (median distance between neighbours) of a point: on even samples
     of plates with noise up to their thickness the largest gap is 1.0-2.6 spacings, on a case with one open side 4.
     Alpha shapes, of radii `ALPHA_RADII` in spacings, follow cavities and holes down to about two spacings. Points
-    without volume give a plate or rod, `MIN_THICKNESS` of their extent thick.
+    without volume give a plate or rod, `MIN_THICKNESS` of their extent thick. Vertices are float32 numbers, so that a
+    file of such numbers is as closed as the mesh.
     """
-    points = np.unique(np.asarray(points, dtype=np.float64), axis=0)
-    solid = _with_volume(points)
+    points = np.asarray(points, dtype=np.float64)
+    # Tolerances of the libraries suit sizes near one. A power of two changes no digit.
+    unit = 2.0 ** np.ceil(np.log2(max(float(np.abs(points).max()), SMALLEST_UNIT)))
+    mesh = _mesh_of_unit_size(np.unique(_as_float32(points / unit), axis=0))
+    mesh.apply_scale(unit)
+    return mesh
+
+
+def _mesh_of_unit_size(
+    points: np.ndarray,  # [M, 3] float32 numbers, without repetition
+) -> trimesh.Trimesh:
+    solid = _as_float32(_with_volume(points))
     hull = trimesh.convex.convex_hull(solid)
     if len(solid) > len(points):
         return hull
@@ -35,7 +50,7 @@ def part_mesh(
         return hull
     for radius in ALPHA_RADII:
         mesh = _alpha_shape(points, radius * spacing)
-        if mesh.is_watertight and mesh.body_count == 1:
+        if mesh.is_volume and mesh.body_count == 1:
             return mesh
     return hull
 
@@ -52,10 +67,14 @@ def _alpha_shape(points: np.ndarray, radius: float) -> trimesh.Trimesh:
     return mesh
 
 
+def _as_float32(points: np.ndarray) -> np.ndarray:
+    return np.asarray(points, dtype=np.float32).astype(np.float64)
+
+
 def _with_volume(points: np.ndarray) -> np.ndarray:
     directions = np.linalg.eigh(np.cov(points, rowvar=False, bias=True))[1]
     extent = np.ptp(points @ directions, axis=0)
-    thickness = max(MIN_THICKNESS * float(extent.max()), 1e-6)
+    thickness = max(MIN_THICKNESS * float(extent.max()), LEAST_THICKNESS)
     for direction in directions.T[extent < thickness]:
         points = np.concatenate([points - direction * thickness / 2, points + direction * thickness / 2])
     return points

@@ -1,4 +1,4 @@
-"""Pictures of a prediction, drawn with matplotlib alone: no display, no OpenGL."""
+"""Pictures of a prediction, drawn with matplotlib alone: no display, no OpenGL. Scans are points, objects surfaces."""
 
 from __future__ import annotations
 
@@ -9,14 +9,20 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from matplotlib.axes import Axes
+from matplotlib.collections import TriMesh
 from matplotlib.figure import Figure
 from matplotlib.patheffects import Normal, Stroke
+from matplotlib.tri import Triangulation
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from articulate_ssl.geometry.screw import PRISMATIC
-from articulate_ssl.inference.articulation import articulate, canonical_object, posed_parts, to_canonical
+from articulate_ssl.geometry.se3 import invert_se3
+from articulate_ssl.inference.articulation import canonical_object, part_motion, to_canonical
+from articulate_ssl.inference.export.part_mesh import part_mesh
+from articulate_ssl.inference.pictures.joint_arrow import joint_arrow
 from articulate_ssl.inference.pictures.part_colour import part_colour
+from articulate_ssl.inference.pictures.surface import LitTriangles, Surface, cut_small, lit_triangles
 from articulate_ssl.inference.pictures.viewpoint import viewing_rotation
 from articulate_ssl.inference.prediction import Prediction
 from datamodules.atomic import atomic_write
@@ -35,12 +41,14 @@ class SampleRow:
         points: [N, 3] the input, camera space.
         prediction: Its prediction, B = 1, on the same points.
         true_part: [N] ground-truth parts, numbered as the prediction numbers them, or None.
+        upright: Whether the network was trained on clouds of an upright camera (see `viewpoint.level_frame`).
     """
 
     title: str
     points: np.ndarray
     prediction: Prediction
     true_part: np.ndarray | None = None
+    upright: bool = False
 
 
 def draw_prediction(
@@ -48,10 +56,11 @@ def draw_prediction(
     points: np.ndarray,  # [N, 3] the cloud, camera space
     part_id: np.ndarray,  # [N] predicted part of every point
     state_range: Tensor,  # [J, 2] lowest and highest joint state
+    upright: bool,
     path: str | os.PathLike,
 ) -> None:
     """Write the picture of `prediction_figure` as PNG, whole or not at all."""
-    _save(prediction_figure(prediction, points, part_id, state_range), path)
+    _save(prediction_figure(prediction, points, part_id, state_range, upright), path)
 
 
 def draw_test_samples(rows: Sequence[SampleRow], path: str | os.PathLike) -> None:
@@ -64,31 +73,35 @@ def prediction_figure(
     points: np.ndarray,  # [N, 3]
     part_id: np.ndarray,  # [N]
     state_range: Tensor,  # [J, 2]
+    upright: bool = False,
 ) -> Figure:
     """Six panels: input by part, reconstruction, canonical object with its joints, and three articulation states.
 
     The states are the ends and the middle of `state_range`, as in the paper's manipulation figure; an object without
     joints has the first three panels only. The predicted base pose is undone, and all panels share one view and scale.
+    `upright` says that the network was trained on clouds of an upright camera (see `viewpoint.level_frame`).
     """
     prediction = prediction.to("cpu")
     state_range = state_range.to(prediction.joint_state)
-    parts = np.repeat(np.arange(prediction.num_parts), prediction.part_shape.shape[2])
-    panels = [
-        ("Input, by predicted part", torch.as_tensor(points), part_id),
-        ("Reconstruction", posed_parts(prediction)[0], parts),
-        ("Canonical object and joints", articulate(prediction, torch.zeros_like(prediction.joint_state))[0], parts),
+    motions = [
+        ("Reconstruction", _predicted_motion(prediction)),
+        ("Canonical object and joints", part_motion(prediction, torch.zeros_like(prediction.joint_state))[0]),
     ]
     for share in (0.0, 0.5, 1.0) if len(state_range) else ():
         states = torch.lerp(state_range[:, 0], state_range[:, 1], share)
-        panels.append((f"Articulated to {_state_text(prediction, states)}", articulate(prediction, states)[0], parts))
+        motions.append((f"Articulated to {_state_text(prediction, states)}", part_motion(prediction, states)[0]))
 
-    view = viewing_rotation(prediction, state_range)
-    arrows = [_joint_arrow(prediction, j) @ view.T for j in range(len(state_range))]
-    shapes = [_seen(prediction, cloud, view) for _, cloud, _ in panels]
-    window = _window([*shapes, *arrows])
-    figure, axes = _grid([window], len(panels))
-    for ax, (title, _, ids), shape in zip(axes[0], panels, shapes, strict=True):
-        _draw_cloud(ax, shape, ids, window)
+    view = viewing_rotation(prediction, state_range, upright)
+    cloud = _seen(prediction, torch.as_tensor(points), view)
+    surfaces = _surfaces(prediction, cloud)
+    drawings = [lit_triangles(surfaces, _seen_pose(motion, view)) for _, motion in motions]
+    arrows = [joint_arrow(prediction, j) @ view.T for j in range(len(state_range))]
+    window = _window([cloud, *arrows, *(drawing.corners.reshape(-1, 2) for drawing in drawings)])
+    figure, axes = _grid([window], len(motions) + 1)
+    _draw_cloud(axes[0, 0], cloud, part_id, window)
+    axes[0, 0].set_title("Input, by predicted part", fontsize=9, color=INK)
+    for ax, (title, _), drawing in zip(axes[0, 1:], motions, drawings, strict=True):
+        _draw_surfaces(ax, drawing, window)
         ax.set_title(title, fontsize=9, color=INK)
     for arrow in arrows:
         _draw_arrow(axes[0, 2], arrow)
@@ -97,21 +110,22 @@ def prediction_figure(
 
 def samples_figure(rows: Sequence[SampleRow]) -> Figure:
     """A row per sample: input by ground-truth part (grey if unknown), by predicted part, and the reconstruction."""
-    shapes, windows = [], []
+    clouds, drawings, windows = [], [], []
     for row in rows:
         prediction = row.prediction.to("cpu")
-        view = viewing_rotation(prediction, prediction.joint_state[0, :, None].expand(-1, 2))
-        points = _seen(prediction, torch.as_tensor(row.points), view)
-        shapes.append((points, points, _seen(prediction, posed_parts(prediction)[0], view)))
-        windows.append(_window(shapes[-1]))
+        view = viewing_rotation(prediction, prediction.joint_state[0, :, None].expand(-1, 2), row.upright)
+        clouds.append(_seen(prediction, torch.as_tensor(row.points), view))
+        drawings.append(
+            lit_triangles(_surfaces(prediction, clouds[-1]), _seen_pose(_predicted_motion(prediction), view))
+        )
+        windows.append(_window([clouds[-1], drawings[-1].corners.reshape(-1, 2)]))
 
     figure, axes = _grid(windows, 3)
-    for row, row_axes, row_shapes, window in zip(rows, axes, shapes, windows, strict=True):
+    for row, row_axes, cloud, drawing, window in zip(rows, axes, clouds, drawings, windows, strict=True):
         truth = np.full(len(row.points), -1) if row.true_part is None else row.true_part
-        predicted = row.prediction.part_id[0].cpu().numpy()
-        parts = np.repeat(np.arange(row.prediction.num_parts), row.prediction.part_shape.shape[2])
-        for ax, shape, ids in zip(row_axes, row_shapes, (truth, predicted, parts), strict=True):
-            _draw_cloud(ax, shape, ids, window)
+        _draw_cloud(row_axes[0], cloud, truth, window)
+        _draw_cloud(row_axes[1], cloud, row.prediction.part_id[0].cpu().numpy(), window)
+        _draw_surfaces(row_axes[2], drawing, window)
         row_axes[0].set_title(row.title, fontsize=9, color=INK, loc="left", fontweight="bold")
     heading = "Input" if all(r.true_part is None for r in rows) else "Input, by true part"
     for ax, text in zip(axes[-1], (heading, "By predicted part", "Reconstruction"), strict=True):
@@ -119,9 +133,34 @@ def samples_figure(rows: Sequence[SampleRow]) -> Figure:
     return figure
 
 
+def _predicted_motion(prediction: Prediction) -> Tensor:  # [K, 4, 4] float64
+    """Motion of every part in canonical object space as its pose has it, whether or not it obeys the joints."""
+    apart = torch.eye(4, dtype=torch.float64).repeat(prediction.num_parts, 1, 1)
+    apart[:, :3, 3] = -prediction.assembly[0].double()
+    return invert_se3(prediction.base_pose[0].double()) @ prediction.part_pose[0].double() @ apart
+
+
+def _surfaces(
+    prediction: Prediction,
+    cloud: np.ndarray,  # [N, 3] beside which they are drawn
+) -> list[Surface]:
+    """Those of the parts, in canonical object space."""
+    meshes = [part_mesh(shape) for shape in canonical_object(prediction)[0].double().numpy()]
+    return cut_small(meshes, float(np.ptp(cloud, axis=0).max()))
+
+
+def _seen_pose(
+    motion: Tensor,  # [K, 4, 4] canonical object space -> itself
+    view: np.ndarray,  # [3, 3]
+) -> np.ndarray:  # [K, 4, 4] canonical object space -> right, up, towards the viewer
+    turn = np.eye(4)
+    turn[:3, :3] = view
+    return turn @ motion.double().numpy()
+
+
 def _window(shapes: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Centre [2] and half size [2] of the rectangle that holds all projected shapes."""
-    flat = np.concatenate(shapes)[:, :2]
+    flat = np.concatenate([shape[:, :2] for shape in shapes])
     low, high = flat.min(axis=0), flat.max(axis=0)
     half = 0.53 * (high - low)
     return (low + high) / 2, np.maximum(half, max(0.4 * half.max(), 1e-9))
@@ -149,12 +188,28 @@ def _draw_cloud(
     depth = (shape[:, 2] - shape[:, 2].min()) / max(np.ptp(shape[:, 2]), 1e-12)
     colour = np.where(part_id[:, None] < 0, 150, part_colour(part_id)) / 255 * brightness[:, None]
     colour = 1 - (0.7 + 0.3 * depth[:, None]) * (1 - colour)
-    center, half = window
-    diameter = np.clip(2.0 * spacing * PANEL_INCHES * 72 / (2 * half[0]), 1.2, 9.0)
+    diameter = np.clip(2.0 * spacing * PANEL_INCHES * 72 / (2 * window[1][0]), 1.2, 9.0)
     order = np.argsort(shape[:, 2])
     ax.scatter(
         *shape[order, :2].T, s=diameter[order] ** 2, c=colour[order], linewidths=0.2, edgecolors=0.7 * colour[order]
     )
+    _show_window(ax, window)
+
+
+def _draw_surfaces(
+    ax: Axes,
+    triangles: LitTriangles,
+    window: tuple[np.ndarray, np.ndarray],
+) -> None:
+    corners, colours = triangles.corners.reshape(-1, 2), np.repeat(triangles.colour, 3, axis=0)
+    mesh = TriMesh(Triangulation(*corners.T, np.arange(len(corners)).reshape(-1, 3)))
+    mesh.set_facecolor(colours)
+    ax.add_collection(mesh)
+    _show_window(ax, window)
+
+
+def _show_window(ax: Axes, window: tuple[np.ndarray, np.ndarray]) -> None:
+    center, half = window
     ax.set_xlim(center[0] - half[0], center[0] + half[0])
     ax.set_ylim(center[1] - half[1], center[1] + half[1])
     ax.set_aspect("equal")
@@ -177,21 +232,6 @@ def _draw_arrow(ax: Axes, arrow: np.ndarray) -> None:
     halo = [Stroke(linewidth=3.6, foreground="white"), Normal()]
     ax.annotate("", xy=arrow[2, :2], xytext=arrow[0, :2], arrowprops=style | {"path_effects": halo}, zorder=3)
     ax.plot(*arrow[1, :2], "o", color="white", markeredgecolor=INK, markersize=4.5, zorder=4)
-
-
-def _joint_arrow(
-    prediction: Prediction,
-    joint: int,
-) -> np.ndarray:  # [3, 3] tail, pivot, tip, in canonical object space
-    """The joint line where it passes the part that it moves, a little longer than that part."""
-    axis = prediction.canonical_axis[0, joint].double().numpy()
-    pivot = prediction.canonical_pivot[0, joint].double().numpy()
-    part = canonical_object(prediction)[0, prediction.joint_child[0, joint]].double().numpy()
-    along = (part - pivot) @ axis
-    middle = (part.min(axis=0) + part.max(axis=0)) / 2
-    anchor = middle if prediction.joint_type[0, joint] == PRISMATIC else pivot + axis * (along.min() + along.max()) / 2
-    reach = 0.6 * max(np.ptp(along), 0.6 * np.ptp(part, axis=0).max())
-    return np.stack([anchor - axis * reach, anchor, anchor + axis * reach])
 
 
 def _state_text(prediction: Prediction, states: Tensor) -> str:

@@ -56,6 +56,7 @@ class Recipe(ABC):
         self.schedule, self.discovery = schedule, discovery
 
     learns_tree = True  # or it was found before, and stays
+    cheap_steps = 0  # so many at the start are of another kind, which takes less time than the steps to come
 
     @property
     def ready(self) -> bool:

@@ -61,6 +61,11 @@ class TrainingRecipe(Recipe):
         self.group = rotation_group(len(self.estimator.articulated.pose_head.elements))
 
     @property
+    def cheap_steps(self) -> int:
+        """Stage 0 and the warm-up: no registration in every step."""
+        return self._warm
+
+    @property
     def ready(self) -> bool:
         """After discovery."""
         return self.found is not None

@@ -1,13 +1,15 @@
 """Exit codes and messages of `lightning fit|validate|test`, in this process."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
 import torch
+import yaml
 from refusal import refused
 
-from articulate_ssl.cli import main
+from articulate_ssl.cli import main, unsaid
 from articulate_ssl.training.checkpoint import load_module
 
 
@@ -108,3 +110,107 @@ def test_a_range_of_orientations_is_remembered_and_told(run, workplace, capsys):
     np.save(workplace / "upright.npy", np.random.default_rng(0).normal(size=(500, 3)))
     main(["predict", "upright.npy", "--ckpt", str(checkpoint), "--out", "upright-result"])
     assert "y down" in capsys.readouterr().out
+
+
+@pytest.fixture
+def without_gpu(monkeypatch):
+    monkeypatch.setattr(unsaid, "accelerator_available", lambda: False)
+
+
+def printed(capsys, *words) -> dict:
+    """The configuration that a command would run with."""
+    with pytest.raises(SystemExit):
+        main([*words, "--print_config"])
+    return yaml.safe_load(capsys.readouterr().out)
+
+
+def test_without_a_gpu_the_cpu_profile_applies_and_what_is_typed_wins(workplace, without_gpu, monkeypatch, capsys):
+    monkeypatch.chdir(workplace)
+    monkeypatch.setattr(sys, "argv", ["lightning"])
+    (workplace / "big.yaml").write_text("{data: {category: laptop, num_points: 512}, model: {num_parts: 2}}")
+    (workplace / "mine.yaml").write_text("{trainer: {max_steps: 7}}")
+    (workplace / "whole.yaml").write_text("{trainer: {accelerator: auto}}")
+    config = printed(capsys, "fit", "-c", "big.yaml", "-c", "mine.yaml", "--data.batch_size", "5")
+    assert (config["data"]["num_points"], config["model"]["network"]["group_order"]) == (256, 12)
+    assert (config["trainer"]["max_steps"], config["data"]["batch_size"]) == (7, 5)
+    config = printed(capsys, "fit", "-c", "big.yaml", "-c", "whole.yaml")
+    assert (config["data"]["num_points"], config["model"]["network"]["group_order"]) == (512, 60)
+
+
+def test_what_was_added_is_told_in_one_line(run, workplace, without_gpu):
+    (workplace / "big.yaml").write_text("{data: {category: laptop, root: nowhere}, model: {num_parts: 2}}")
+    _, message = run("fit", "-c", "big.yaml")
+    assert len([line for line in message.splitlines() if line.startswith("lightning fit: no GPU")]) == 1
+
+
+def test_fit_then_test_without_any_option(run, workplace, capsys):
+    """The run's own configuration is taken, with options that no file names, and nothing of wandb is left in it."""
+    folder = f"--trainer.default_root_dir={workplace / 'runs' / 'bare'}"
+    sizes = ("--model.network.head_dim=12", "--model.recipe=paper")
+    assert run("fit", "-c", "laptop.yaml", *sizes, folder)[0] == 0
+    refused(run("test", "-c", "laptop.yaml", folder), "other network sizes", "leave -c out")
+    for command in ("test", "validate"):
+        code, message = run(command)
+        assert code == 0
+        assert "newest run, checkpoint" in message and "bare/lightning_logs/version_0/config.yaml" in message
+    assert len(list((workplace / "runs" / "bare").rglob("test_samples.png"))) == 1
+
+
+def test_fit_says_how_long_it_will_take(workplace, monkeypatch, capsys):
+    monkeypatch.chdir(workplace)
+    monkeypatch.setattr(sys, "argv", ["lightning"])
+    command = ("fit", "-c", "laptop.yaml", "--model.recipe=paper", "--trainer.max_steps=22")
+    assert main([*command, f"--trainer.default_root_dir={workplace / 'long'}"]) == 0
+    told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("lightning fit: ")]
+    assert [line.split(" for ")[1].split(" (")[0] for line in told] == ["22 steps", "21 steps"]
+
+
+@pytest.mark.parametrize("name", ["foo", "foo.pt", "foo.safetensors"])
+@pytest.mark.parametrize("separator", [" ", "="])
+def test_a_checkpoint_of_another_suffix_is_refused(run, workplace, name, separator):
+    (workplace / name).write_bytes((workplace / "trained.ckpt").read_bytes())
+    words = f"--ckpt_path{separator}{name}".split()
+    refused(run("test", "-c", "laptop.yaml", *words), name, "not a .ckpt file")
+
+
+def test_a_folder_of_checkpoints_is_refused_with_the_newest(run, workplace):
+    refused(run("fit", "-c", "laptop.yaml", "--ckpt_path", "."), "a folder", ".ckpt")
+
+
+def test_curves_and_pictures_go_to_weights_and_biases_if_asked_for(run, workplace, monkeypatch):
+    """Without account and network."""
+    import wandb
+
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    root = workplace / "with-wandb"
+    options = (f"--trainer.default_root_dir={root}", "--model.recipe=paper", "--trainer.log_every_n_steps=1")
+    for command, flag in (("fit", ["--wandb"]), ("test", ["--wandb", "mine"])):
+        assert run(command, "-c", "laptop.yaml", *options, *flag)[0] == 0
+        wandb.finish()
+    wandb.teardown()  # not until then is everything written
+    sent = [path.read_bytes() for path in root.glob("wandb/offline-run-*/run-*.wandb")]
+    curves, results = sorted(sent, key=lambda content: b"test_samples" in content)
+    assert b"articulate-ssl" in curves and b"state_spread" in curves and b"test/seg_miou" not in curves
+    assert all(name in results for name in (b"mine", b"test/r_err_deg", b"test/seg_miou", b"test_samples"))
+    assert len(list(root.glob("wandb/offline-run-*/files/media/images/*.png"))) == 1
+    (config,) = root.glob("lightning_logs/version_0/config.yaml")  # the run's folder is where it was without the flag
+    assert yaml.safe_load(config.read_text())["wandb"] is None
+
+
+def test_what_weights_and_biases_refuses_is_told_in_one_line(run, workplace, monkeypatch):
+    import wandb
+
+    def init(**_):
+        raise wandb.errors.UsageError("No API key configured. Use `wandb login` to log in.")
+
+    monkeypatch.setattr(wandb, "init", init)
+    folder = f"--trainer.default_root_dir={workplace / 'no-account'}"
+    refused(run("fit", "-c", "laptop.yaml", "--model.recipe=paper", folder, "--wandb"), "wandb login", "WANDB_MODE")
+
+
+def test_without_its_flag_nothing_of_wandb_is_imported_or_written(run, workplace, monkeypatch):
+    monkeypatch.setitem(sys.modules, "wandb", None)  # what imports it, fails
+    folder = workplace / "no-wandb"
+    assert run("fit", "-c", "laptop.yaml", "--model.recipe=paper", f"--trainer.default_root_dir={folder}")[0] == 0
+    assert list(folder.rglob("last.ckpt")) and not list(folder.rglob("*wandb*"))

@@ -69,6 +69,29 @@ def test_a_checkpoint_of_another_project_is_refused(tmp_path, content):
 
 
 def test_a_missing_checkpoint_says_how_to_make_one(tmp_path):
-    for path in (tmp_path / "none.ckpt", tmp_path):
-        with pytest.raises(CheckpointError, match=r"no such checkpoint.*lightning fit"):
-            read_checkpoint(path)
+    with pytest.raises(CheckpointError, match=r"no such checkpoint.*lightning fit"):
+        read_checkpoint(tmp_path / "none.ckpt")
+
+
+def test_a_folder_is_refused_with_the_newest_checkpoint_in_it(checkpoint, tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(CheckpointError, match=r"a folder, not a checkpoint.*newest one in it is .*good\.ckpt"):
+        read_checkpoint(tmp_path)
+    with pytest.raises(CheckpointError, match=r"a folder, not a checkpoint; name a \.ckpt file"):
+        read_checkpoint(tmp_path / "empty")
+
+
+@pytest.mark.parametrize("name", ["good", "good.pt", "good.ckpt.zip", "good.safetensors"])
+def test_a_file_of_another_suffix_is_refused(checkpoint, name):
+    """Lightning chooses its reader by the suffix."""
+    other = checkpoint.rename(checkpoint.parent / name)
+    with pytest.raises(CheckpointError, match=r"not a \.ckpt file"):
+        read_checkpoint(other)
+
+
+@pytest.mark.parametrize("first", range(0, 256, 5))
+def test_bytes_of_any_kind_are_refused(tmp_path, first):
+    """torch's reader of old formats fails on such files in ways of its own, IndexError among them."""
+    (tmp_path / "x.ckpt").write_bytes(bytes([first, 46, 46, 10]))
+    with pytest.raises(CheckpointError, match="damaged"):
+        read_checkpoint(tmp_path / "x.ckpt")

@@ -1,3 +1,5 @@
+import json
+
 import numpy as np
 import pytest
 import synthetic_predictions as synthetic
@@ -32,3 +34,54 @@ def test_a_diverged_prediction_is_refused():
 def test_a_batch_is_refused():
     with pytest.raises(ValueError, match="batch of 2"):
         result_of(synthetic.laptop, prediction=synthetic.laptop()[0][torch.tensor([0, 0])])
+
+
+def test_articulated_to_its_own_states_it_is_where_it_was_scanned():
+    for make in OBJECTS:
+        result = result_of(make)
+        moved = result.articulate(result.states)
+        np.testing.assert_allclose(moved, result.reconstruction, atol=1e-5)
+        assert moved.shape == result.reconstruction.shape == (len(result.parts), *result.parts[0].shape.shape)
+
+
+def test_only_what_a_joint_moves_moves():
+    result = result_of(synthetic.drawer)
+    joint = result.joints[1]
+    states = result.states.copy()
+    states[1] += 0.05
+    moved = np.linalg.norm(result.articulate(states) - result.articulate(result.states), axis=-1)
+    np.testing.assert_allclose(moved[joint.child], 0.05, atol=1e-9)
+    others = [part.id for part in result.parts if part.id != joint.child]
+    np.testing.assert_allclose(moved[others], 0, atol=1e-9)
+
+
+@pytest.mark.parametrize("states", [[], [0.1, 0.2], [float("nan")]])
+def test_states_that_do_not_fit_the_joints_are_refused(states):
+    with pytest.raises(ValueError, match="1 finite joint states are needed"):
+        result_of(synthetic.laptop).articulate(states)
+
+
+def test_parts_and_joints_are_those_of_the_json():
+    for make in OBJECTS:
+        result = result_of(make)
+        content = result.to_dict()
+        json.dumps(content)
+        for part, told in zip(result.parts, content["parts"], strict=True):
+            assert (part.id, part.parent, part.num_points) == (told["id"], told["parent"], told["num_points"])
+            np.testing.assert_array_equal(part.pose, told["pose"])
+        for joint, told in zip(result.joints, content["joints"], strict=True):
+            for name in ("name", "type", "parent", "child", "state"):
+                assert getattr(joint, name) == told[name]
+            for name in ("axis", "pivot", "limits"):
+                np.testing.assert_array_equal(getattr(joint, name), told[name])
+
+
+def test_it_is_exported_in_the_formats_that_are_asked_for(tmp_path):
+    files = result_of(synthetic.laptop).export(tmp_path / "new" / "folder", ["json", "clouds"])
+    assert {file.name for file in files} == {"prediction.json", "parts.ply", "reconstruction.ply"}
+    assert all(file.is_file() for file in files)
+
+
+def test_it_is_shown_in_one_line_without_arrays():
+    shown = repr(result_of(synthetic.laptop))
+    assert "joint_0 revolute 1 on 0 at 68.8°" in shown and "tensor" not in shown and "\n" not in shown

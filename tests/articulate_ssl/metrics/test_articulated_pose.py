@@ -252,11 +252,21 @@ def test_every_quantity_of_the_contract_is_there():
         "instances",
         "symmetric_instances",
         "margin",
+        "probability",
     }
     for name in (*PER_PART, *PER_JOINT, *PER_CLOUD):
         assert {"mean", "median", "ci95"} <= set(result[name])
     assert [len(result[name]["parts"]) for name in PER_PART] == [3] * len(PER_PART)
     assert [len(result[name]["joints"]) for name in PER_JOINT] == [2] * len(PER_JOINT)
+
+
+def test_probabilities_are_reported_where_a_method_has_them():
+    labels = articulated_labels()
+    prediction = perfect_oracle(labels)
+    assert score(prediction, labels)["probability"] is None
+    metrics = ArticulatedPoseMetrics(calibrate(prediction, labels))
+    metrics.update(prediction, labels, torch.full((len(prediction.margin),), 0.9))
+    assert metrics.compute()["probability"]["reliability"]["expected_calibration_error"] == pytest.approx(0.1)
 
 
 def test_keys_of_older_reports_keep_their_order():

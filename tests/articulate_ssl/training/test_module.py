@@ -73,7 +73,7 @@ class _Recorder:
     def to(self, device):
         return self
 
-    def update(self, prediction, batch, seconds):
+    def update(self, prediction, batch, seconds, probability):
         self.predictions.append(prediction)
 
     def write(self, *_):
@@ -283,13 +283,14 @@ def test_predictions_see_points_only(root):
 
 def test_predicting_a_scan_of_any_unit_and_origin(trained):
     cloud = _clouds(1)[0].double().numpy()
-    near, center, scale, points = trained[0].predict_cloud(cloud)
-    far, far_center, far_scale, _ = trained[0].predict_cloud(1000 * cloud + [5e3, 0, -2e3])
+    near = trained[0].predict_cloud(cloud)
+    far = trained[0].predict_cloud(1000 * cloud + [5e3, 0, -2e3])
     count = trained[0].inference.points  # a scan of fewer points repeats them
-    assert points.shape == (count, 3) and near.part_id.shape == (1, count)
-    np.testing.assert_allclose(far_center, 1000 * center + [5e3, 0, -2e3])
-    assert far_scale == pytest.approx(1000 * scale)
-    _assert_same(replace(near, part_id=far.part_id), far, rtol=1e-2, atol=1e-2)
+    assert near.points.shape == (count, 3) and near.prediction.part_id.shape == (1, count)
+    np.testing.assert_allclose(far.center, 1000 * near.center + [5e3, 0, -2e3])
+    assert far.scale == pytest.approx(1000 * near.scale)
+    prediction = replace(near.prediction, part_id=far.prediction.part_id)
+    _assert_same(prediction, far.prediction, rtol=1e-2, atol=1e-2)
 
 
 @pytest.mark.parametrize(("recipe", "stays"), [("staged", True), ("paper", False)])

@@ -200,7 +200,7 @@ def test_errors_name_the_file(tmp_path):
         load(tmp_path, "safe", "101")
     (folder / "meta.json").write_text(json.dumps({"model_cat": "Safe"})[:-3])
     with pytest.raises(ValueError, match=r"101/meta\.json: not valid JSON"):
-        open_source("partnet-mobility", load_category("safe"), tmp_path, 0).instance_ids()
+        load(tmp_path, "safe", "101")
     with pytest.raises(ValueError, match="no instance found"):
         open_source("partnet-mobility", load_category("safe"), folder / "textured_objs", 0)
     with pytest.raises(ValueError, match="not a folder"):

@@ -2,8 +2,15 @@ import pytest
 import synthetic_predictions as synthetic
 from scan_predictions import OBJECTS, result_of
 
-from articulate_ssl.inference.export import picture, prediction_json, urdf
-from articulate_ssl.inference.export.folder import EXPORTERS, write_prediction
+from articulate_ssl.inference.export import folder as export_folder
+from articulate_ssl.inference.export import picture, prediction_json, rigid_links
+from articulate_ssl.inference.export.folder import (
+    EXPORTERS,
+    EXPORTERS_BY_NAME,
+    ExportError,
+    exporters_named,
+    write_prediction,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -16,7 +23,10 @@ def quick_picture(monkeypatch):
 def test_the_folder_holds_what_was_promised_and_no_more(tmp_path, make):
     files = write_prediction(result_of(make), tmp_path)
     meshes = {f"meshes/part_{k}.stl" for k in range(make()[0].num_parts)}
-    expected = {"prediction.json", "parts.ply", "reconstruction.ply", "object.urdf", "picture.png"} | meshes
+    clouds = {"parts.ply", "reconstruction.ply"}
+    models = {"object.urdf", "object.xml", "object.glb", "object.usda"}
+    expected = {"prediction.json", "prediction.npz", "picture.png"} | clouds | models | meshes
+    assert len(files) == len(expected)
     assert {str(f.relative_to(tmp_path)) for f in files} == expected
     assert {str(f.relative_to(tmp_path)) for f in tmp_path.rglob("*") if f.is_file()} == expected
 
@@ -52,8 +62,33 @@ def test_a_failure_half_way_leaves_the_earlier_results(tmp_path, monkeypatch):
     def fail(*_):
         raise RuntimeError("disk full")
 
-    monkeypatch.setattr(urdf, "part_mesh", fail)
+    monkeypatch.setattr(rigid_links, "canonical_object", fail)
     monkeypatch.setattr(prediction_json, "describe", fail)
     with pytest.raises(RuntimeError):
         write_prediction(result_of(synthetic.laptop), tmp_path)
     assert {f: f.read_bytes() for f in tmp_path.rglob("*") if f.is_file()} == before
+
+
+def test_exporters_are_found_by_name_and_the_json_stays_last():
+    found = exporters_named(["json", "glb", "urdf", "glb"])
+    assert found == tuple(EXPORTERS_BY_NAME[name] for name in ("urdf", "glb", "json"))
+    assert exporters_named(None) == EXPORTERS == tuple(EXPORTERS_BY_NAME.values())
+    assert exporters_named([]) == ()
+
+
+def test_a_format_without_mesh_files_leaves_no_empty_folder(tmp_path):
+    write_prediction(result_of(synthetic.laptop), tmp_path / "new", exporters_named(["json"]))
+    assert [p.name for p in (tmp_path / "new").iterdir()] == ["prediction.json"]
+
+
+def test_an_unknown_name_is_refused_with_the_known_ones():
+    with pytest.raises(ExportError, match=r"no export is called fbx; there are clouds, urdf, .*json"):
+        exporters_named(["urdf", "fbx"])
+
+
+def test_a_format_whose_package_is_missing_is_left_out_and_refused_where_asked_for(monkeypatch):
+    monkeypatch.setattr(export_folder, "find_spec", lambda package: None)
+    assert EXPORTERS_BY_NAME["usd"] not in exporters_named(None)
+    assert len(exporters_named(None)) == len(EXPORTERS_BY_NAME) - 1
+    with pytest.raises(ExportError, match=r"usd needs .*pxr.* pip install 'articulate-ssl\[usd\]'"):
+        exporters_named(["json", "usd"])

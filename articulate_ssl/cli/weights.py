@@ -1,0 +1,141 @@
+"""`articulate-ssl weights list|show|pack|rebuild|check`: the weights that come with the package."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Column, Table
+
+from articulate_ssl.cli import BAD_INPUT
+from articulate_ssl.inference.checkpoint_file import CheckpointError
+from articulate_ssl.training.shipped_weights import WEIGHTS_FOLDER, shipped_as, shipped_weights
+from articulate_ssl.training.weights_card import CARD_SUFFIX, HEADLINES, VIEWS, WeightsCard
+
+# Of `HEADLINES`, as short as a table of all weights needs them.
+_HEADINGS = ("R/°", "flips", "T", "axis/°", "pivot", "state", "mIoU")
+_NOT_REPRODUCED = 1  # the exit code
+_BUILD = Path("build/weights")
+_CHECKS = Path("build/weights-check")
+_CHECK_SEED = 12
+
+
+def run(arguments: list[str]) -> int:
+    """Do what the second word says.
+
+    Returns:
+        Exit code: 0; 1 if weights do not reproduce their cards, or some could not be rebuilt; 2 for bad input.
+
+    Raises:
+        SystemExit: of code 2 for bad arguments, with the usage on stderr; of code 0 for --help.
+    """
+    args = _parser().parse_args(arguments[1:])
+    try:
+        return args.do(args)
+    except (CheckpointError, OSError) as error:
+        print(f"articulate-ssl weights: {error}", file=sys.stderr)
+        return BAD_INPUT
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="articulate-ssl weights", description="Weights that come with the package.")
+    commands = parser.add_subparsers(required=True, metavar="list|show|pack|rebuild|check")
+    commands.add_parser("list", help="which there are, and what they are worth").set_defaults(do=_list)
+
+    show = commands.add_parser("show", help="print the card of one")
+    show.add_argument("name", help="for example laptop-depth")
+    show.set_defaults(do=_show)
+
+    pack = commands.add_parser("pack", help="put a run that was trained and tested into the package")
+    pack.add_argument("run", type=Path, help="its folder; the newest metrics.json under it counts")
+    pack.add_argument("--checkpoint", type=Path, help="what was tested (default: as metrics.json says)")
+    pack.add_argument("--commit", help="of the code that trained (default: that of the working folder)")
+    pack.add_argument("--folder", type=Path, default=WEIGHTS_FOLDER, help="where to (default: the package)")
+    pack.set_defaults(do=_pack)
+
+    rebuild = commands.add_parser("rebuild", help="make data, train, test and pack; can be interrupted and goes on")
+    rebuild.add_argument("--categories", nargs="+", help="default: all")
+    rebuild.add_argument("--views", nargs="+", choices=list(VIEWS), default=list(VIEWS), help="default: both")
+    rebuild.add_argument("--build", type=Path, default=_BUILD, help=f"for data, runs and logs (default: {_BUILD})")
+    rebuild.add_argument("--folder", type=Path, default=WEIGHTS_FOLDER, help="where to (default: the package)")
+    rebuild.set_defaults(do=_rebuild)
+
+    check = commands.add_parser("check", help="test on fresh data and compare with the cards")
+    check.add_argument("names", nargs="*", help="categories or names (default: all)")
+    check.add_argument("--seed", type=int, default=_CHECK_SEED, help=f"of the fresh data (default: {_CHECK_SEED})")
+    check.add_argument("--build", type=Path, default=_CHECKS, help=f"for data and results (default: {_CHECKS})")
+    check.set_defaults(do=_check)
+    return parser
+
+
+def _list(_args: argparse.Namespace) -> int:
+    table = Table(Column("weights", no_wrap=True), "MB", *_HEADINGS, title="means over test clouds")
+    for weights in shipped_weights():
+        card = WeightsCard.load(weights.file.with_suffix(CARD_SUFFIX))
+        means = (card.metrics[name]["mean"] for name in HEADLINES)
+        cells = ("-" if mean is None else f"{mean:.2g}" for mean in means)
+        table.add_row(weights.name, f"{weights.file.stat().st_size / 1e6:.2f}", *cells)
+    Console().print(table)
+    return 0
+
+
+def _show(args: argparse.Namespace) -> int:
+    for weights in _named(args.name):
+        print(WeightsCard.load(weights.file.with_suffix(CARD_SUFFIX)).markdown())
+    return 0
+
+
+def _pack(args: argparse.Namespace) -> int:
+    from articulate_ssl.pretrained.pack import newest_metrics, pack
+    from articulate_ssl.pretrained.rebuild import commit_of
+
+    commit = args.commit or commit_of(Path.cwd())
+    weights = pack(newest_metrics(args.run), args.checkpoint, commit, args.folder)
+    print(f"wrote {weights.file} ({weights.file.stat().st_size / 1e6:.2f} MB) and its card")
+    return 0
+
+
+def _rebuild(args: argparse.Namespace) -> int:
+    from articulate_ssl.pretrained.rebuild import CATEGORIES, rebuild
+
+    failed = rebuild(args.build, _say, args.categories or CATEGORIES, args.views, args.folder)
+    if failed:
+        print("articulate-ssl weights: not all could be made:", *failed, sep="\n  ", file=sys.stderr)
+    return _NOT_REPRODUCED if failed else 0
+
+
+def _check(args: argparse.Namespace) -> int:
+    from articulate_ssl.pretrained.check import check, more_than_chance
+
+    chosen = [weights for name in args.names for weights in _named(name)] or list(shipped_weights())
+    found = []
+    for weights in chosen:
+        comparisons = check(weights, args.seed, args.build, _say)
+        table = Table("quantity", title=f"{weights.name} on fresh data of seed {args.seed}")
+        for column in ("card", "fresh", "worse by chance up to"):
+            table.add_column(column, justify="right")
+        table.add_column("")
+        for one in comparisons:
+            verdict = "worse than the card" if one.worse else "reproduced"
+            table.add_row(one.quantity, f"{one.card:.3g}", f"{one.fresh:.3g}", f"{one.allowed:.2g}", verdict)
+        Console().print(table)
+        found += comparisons
+    worse = [f"{one.weights} {one.quantity}" for one in found if one.worse]
+    print(f"{len(found) - len(worse)} of {len(found)} numbers reproduced", *worse, sep="\n  worse: ")
+    if more_than_chance(found):
+        print("more are worse than chance explains: the cards do not hold")
+        return _NOT_REPRODUCED
+    return 0
+
+
+def _named(name: str):
+    if not (found := shipped_as(name)):
+        known = ", ".join(weights.name for weights in shipped_weights())
+        raise CheckpointError(f"{name}: no such weights in the package; there are {known or 'none'}")
+    return found
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)

@@ -1,0 +1,115 @@
+"""Poses, joint states and joint lines of all clouds of one object at once: point to plane, between all clouds.
+
+What bundle adjustment is to photographs. Every point is brought to canonical object space with the part it belongs to,
+and pulled onto the plane of its nearest neighbour from another cloud.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import roma
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from articulate_ssl.discovery.one_object.surface import Surface
+from articulate_ssl.geometry.se3 import invert_se3, se3
+from articulate_ssl.shape.joints import Joints
+
+_NEIGHBOURS = 8  # candidates among which one of another cloud is looked for
+_ALIKE = 0.8  # least cosine between normals
+_ITERATIONS = 12  # of L-BFGS between two matchings
+_FARTHEST = (0.06, 0.03, 0.015, 0.015)  # normalised units: matches beyond are none, matching by matching
+_SOFT = 0.003  # normalised units: residuals beyond count linearly
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Joints, and where and how the object is in each of n clouds.
+
+    Attributes:
+        joints: In canonical object space.
+        base: [n, 4, 4] canonical object space -> cloud.
+        state: [n, J].
+    """
+
+    joints: Joints
+    base: Tensor
+    state: Tensor
+
+    @property
+    def pose(self) -> Tensor:
+        """[n, K, 4, 4] canonical object space -> clouds."""
+        return self.joints.part_pose(self.base, self.state)
+
+
+def adjusted(
+    placed: Placed,  # float64
+    surfaces: list[Surface],  # n, of as many points each
+    label: np.ndarray,  # [n, N]
+) -> Placed:
+    """The same after a few rounds of matching and descent."""
+    points = torch.from_numpy(np.stack([s.points for s in surfaces]))
+    normals = torch.from_numpy(np.stack([s.normals for s in surfaces]))
+    part = torch.from_numpy(label)
+    for farthest in _FARTHEST:
+        placed = _descended(placed, points, part, *_matches(placed.pose, points, normals, part, farthest))
+    return placed
+
+
+def _canonical(pose: Tensor, points: Tensor, part: Tensor) -> Tensor:
+    """Points [n, N, 3] of clouds in canonical object space."""
+    back = invert_se3(pose)[torch.arange(len(points))[:, None], part]  # [n, N, 4, 4]
+    return (back[..., :3, :3] @ points[..., None]).squeeze(-1) + back[..., :3, 3]
+
+
+def _matches(
+    pose: Tensor, points: Tensor, normals: Tensor, part: Tensor, farthest: float
+) -> tuple[Tensor, Tensor, Tensor]:  # [m], [m], [m, 3]
+    """Flat indices of points and of their matches, and the matches' normals in canonical object space."""
+    n, count = points.shape[:2]
+    with torch.no_grad():
+        flat = _canonical(pose, points, part).flatten(0, 1).numpy()
+        turned = torch.zeros_like(pose)
+        turned[..., :3, :3], turned[..., 3, 3] = pose[..., :3, :3], 1
+        normal = _canonical(turned, normals, part).flatten(0, 1).numpy()
+    owner, piece = np.repeat(np.arange(n), count), part.flatten().numpy()
+    ones, others = [], []
+    for k in np.unique(piece):
+        mine = np.flatnonzero(piece == k)
+        distance, index = cKDTree(flat[mine]).query(flat[mine], k=min(n + _NEIGHBOURS, len(mine)))
+        index = mine[index]
+        fits = (owner[index] != owner[mine, None]) & (distance < farthest)
+        fits &= np.abs(np.einsum("mki,mi->mk", normal[index], normal[mine])) > _ALIKE
+        some, first = fits.any(axis=1), fits.argmax(axis=1)
+        ones.append(mine[some])
+        others.append(index[some, first[some]])
+    match = np.concatenate(others)
+    return torch.from_numpy(np.concatenate(ones)), torch.from_numpy(match), torch.from_numpy(normal[match])
+
+
+def _descended(placed: Placed, points: Tensor, part: Tensor, one: Tensor, other: Tensor, normal: Tensor) -> Placed:
+    free = [torch.zeros_like(v, requires_grad=True) for v in (placed.base[:, 0, :3], placed.base[:, 0, :3])]
+    free += [torch.zeros_like(v, requires_grad=True) for v in (placed.state, placed.joints.axis, placed.joints.pivot)]
+    optimizer = torch.optim.LBFGS(free, max_iter=_ITERATIONS, line_search_fn="strong_wolfe")
+
+    def loss() -> Tensor:
+        optimizer.zero_grad()
+        flat = _canonical(_moved(placed, *free).pose, points, part).flatten(0, 1)
+        residual = ((flat[one] - flat[other]) * normal).sum(dim=-1)
+        value = torch.nn.functional.huber_loss(residual / _SOFT, torch.zeros_like(residual))
+        value.backward()
+        return value
+
+    with torch.enable_grad():
+        optimizer.step(loss)
+    return _moved(placed, *(v.detach() for v in free))
+
+
+def _moved(placed: Placed, turn: Tensor, shift: Tensor, state: Tensor, axis: Tensor, pivot: Tensor) -> Placed:
+    joints = placed.joints
+    base = se3(placed.base[:, :3, :3] @ roma.rotvec_to_rotmat(turn), placed.base[:, :3, 3] + shift)
+    axis = torch.nn.functional.normalize(joints.axis + axis, dim=-1)
+    return Placed(replace(joints, axis=axis, pivot=joints.pivot + pivot), base, placed.state + state)

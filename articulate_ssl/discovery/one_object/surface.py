@@ -1,0 +1,79 @@
+"""A dense cloud as a sampled surface: points with normals, and how far other oriented points are from it.
+
+Distances between samples of one surface are half a spacing long even where nothing is wrong. Measured along normals
+they vanish, which is what tells a drawer's side from the wall it slides along.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+_NORMAL_NEIGHBOURS = 12
+_NEIGHBOURS = 6  # surface samples that a query is compared with
+_ALIKE = 0.8  # least cosine between the normals of a query and a sample on the same face
+# Tangential distance to the nearest sample, in spacings, beyond which a query lies past the edge of the face.
+_BEYOND = 2.0
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Oriented samples of one cloud.
+
+    Attributes:
+        points: [N, 3].
+        normals: [N, 3] unit, of either sign.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+
+    @staticmethod
+    def of(points: np.ndarray) -> Surface:
+        """Normals from the plane of least squares through every point's neighbours."""
+        around = points[cKDTree(points).query(points, k=_NORMAL_NEIGHBOURS)[1]]
+        around = around - around.mean(axis=1, keepdims=True)
+        return Surface(points, np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))[1][..., 0])
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Of the points."""
+        return cKDTree(self.points)
+
+    @cached_property
+    def spacing(self) -> float:
+        """Median distance between neighbouring samples."""
+        return float(np.median(self.tree.query(self.points, k=2)[0][:, 1]))
+
+    def thinned(self, count: int) -> Surface:
+        """The first `count` samples, an even selection where points are in farthest-point order."""
+        return Surface(self.points[:count], self.normals[:count])
+
+    def moved(self, pose: np.ndarray) -> Surface:
+        """Under a pose [4, 4], or a pose of every point [N, 4, 4]."""
+        rotation = pose[..., :3, :3]
+        return Surface(
+            np.einsum("...ij,nj->ni" if pose.ndim == 2 else "nij,nj->ni", rotation, self.points) + pose[..., :3, 3],
+            np.einsum("...ij,nj->ni" if pose.ndim == 2 else "nij,nj->ni", rotation, self.normals),
+        )
+
+    def nearest(
+        self,
+        query: Surface,  # Q samples
+        cap: float,
+    ) -> tuple[np.ndarray, np.ndarray]:  # [Q], [Q]
+        """Distance of oriented points to this surface, at most `cap`, and the sample it was measured to.
+
+        Along the sample's normal, and past the edge of the face also along the face.
+        """
+        distance, index = self.tree.query(query.points, k=_NEIGHBOURS)
+        along = np.abs(np.einsum("qki,qki->qk", self.normals[index], query.points[:, None] - self.points[index]))
+        past = np.sqrt(np.maximum(distance**2 - along**2, 0)) - _BEYOND * self.spacing
+        alike = np.abs(np.einsum("qki,qi->qk", self.normals[index], query.normals)) > _ALIKE
+        error = np.where(alike, np.hypot(along, np.maximum(past, 0)), cap)
+        best = error.argmin(axis=1)
+        rows = np.arange(len(best))
+        return np.minimum(error[rows, best], cap), index[rows, best]

@@ -1,0 +1,46 @@
+"""One object from clouds of it alone."""
+
+from itertools import permutations
+
+import pytest
+import torch
+from articulated_objects import DRAWER, LAPTOP, clouds
+
+from articulate_ssl.discovery.discover import DiscoveryError
+from articulate_ssl.discovery.one_object.find import MIN_CLOUDS, find_one_object
+
+
+def _mean_iou(found: torch.Tensor, true: torch.Tensor, num_parts: int) -> float:
+    def iou(order: tuple[int, ...]) -> float:
+        same = [(found == order[k], true == k) for k in range(num_parts)]
+        return sum(float((a & b).sum() / (a | b).sum()) for a, b in same) / num_parts
+
+    return max(map(iou, permutations(range(num_parts))))
+
+
+@pytest.mark.parametrize(("design", "least"), [(LAPTOP, 0.95), (DRAWER, 0.9)], ids=["laptop", "drawer"])
+def test_parts_states_and_joints_are_exact(design, least):
+    data = clouds(design, count=8, points=1024, resample=True, seed=1)
+    found = find_one_object(data.points, 2, design[4], part_points=256)
+    assert _mean_iou(found.label, data.part.expand_as(found.label), 2) > least
+    assert torch.corrcoef(torch.stack([found.state[:, 0], data.state[:, 0].double()]))[0, 1].abs() > 0.999
+    joints = found.shape.joints
+    root = joints.part_pose(found.base, found.state)[:, joints.chain.root, :3, :3]
+    axis, truth = root @ joints.axis[0], data.base[:, :3, :3].double() @ data.axis[0].double()
+    assert (axis * truth).sum(dim=-1).abs().clamp(max=1).acos().rad2deg().max() < 1.5
+    assert joints.limits.tolist() == [[found.state.min().item(), found.state.max().item()]]
+    assert torch.bincount(found.shape.label).tolist() == [256, 256]
+    assert found.unexplained < 0.1
+
+
+def test_too_few_clouds_are_refused():
+    data = clouds(LAPTOP, count=MIN_CLOUDS - 1, points=64)
+    with pytest.raises(DiscoveryError, match="7 clouds of one object, at least 8"):
+        find_one_object(data.points, 2, LAPTOP[4])
+
+
+def test_an_object_that_does_not_move_is_refused():
+    data = clouds(LAPTOP, count=8, points=256, resample=True)
+    still = data.points[:1].repeat(8, 1, 1)
+    with pytest.raises(DiscoveryError, match="parts"):
+        find_one_object(still, 2, LAPTOP[4])

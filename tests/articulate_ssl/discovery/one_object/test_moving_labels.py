@@ -1,0 +1,45 @@
+"""Points go to the part with which they stay on the surface, and labels spread along faces."""
+
+import numpy as np
+from articulated_objects import DRAWER, clouds
+
+from articulate_ssl.discovery.one_object.moving_labels import moving_costs, spread_labels
+from articulate_ssl.discovery.one_object.surface import Surface
+from articulate_ssl.geometry.kinematic_chain import KinematicChain
+from articulate_ssl.shape.joints import Joints
+
+
+def _world() -> tuple[list[Surface], np.ndarray, np.ndarray]:
+    """Clouds of a drawer, the poses of its parts, and the parts of the points."""
+    data = clouds(DRAWER, count=8, points=1024, resample=True, seed=1)
+    joints = Joints(KinematicChain(2, 0, (0,), (1,)), data.axis, data.pivot, DRAWER[4])
+    pose = joints.part_pose(data.base, data.state).double().numpy()
+    return [Surface.of(cloud) for cloud in data.points.double().numpy()], pose, data.part.numpy()
+
+
+def test_what_moves_is_told_from_what_stays():
+    surfaces, pose, part = _world()
+    cost = moving_costs(surfaces, pose, 1024)
+    assert cost.shape == (8, 1024, 2)
+    own = np.take_along_axis(cost, part[None, :, None].repeat(8, axis=0), axis=2)
+    assert np.median(own) < 0.002
+    exchanged = moving_costs(surfaces, pose[:, ::-1], 1024)
+    np.testing.assert_allclose(exchanged, cost[..., ::-1], atol=1e-12)
+
+
+def test_labels_that_spread_along_faces_are_better_than_those_of_single_points():
+    surfaces, pose, part = _world()
+    cost = moving_costs(surfaces, pose, 1024)
+    alone = (cost.argmin(axis=-1) == part).mean()
+    probability = np.stack([spread_labels(s, c) for s, c in zip(surfaces, cost, strict=True)])
+    np.testing.assert_allclose(probability.sum(axis=-1), 1, atol=1e-9)
+    assert (probability.argmax(axis=-1) == part).mean() > alone + 0.02
+
+
+def test_an_undecided_face_follows_its_end():
+    """A strip whose last tenth belongs to part 1, and whose rest could belong to either."""
+    rng = np.random.default_rng(0)
+    strip = Surface.of(np.column_stack([rng.random(400), 0.1 * rng.random(400), np.zeros(400)]))
+    cost = np.zeros((400, 2))
+    cost[strip.points[:, 0] > 0.9, 0] = 0.02
+    assert (spread_labels(strip, cost).argmax(axis=1) == 1).mean() > 0.99

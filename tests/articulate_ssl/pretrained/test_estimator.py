@@ -1,0 +1,138 @@
+"""`articulate_ssl.load` and what it gives: the same prediction for every kind of cloud, and the best of several."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from synthetic import write_synthetic_set
+from tiny import fit, tiny_module
+
+import articulate_ssl
+from articulate_ssl import ArticulatedPoseEstimator, ArticulatedPoseModule, ScanPrediction, load
+from articulate_ssl.inference.checkpoint_file import CheckpointError
+from articulate_ssl.pretrained.estimator import EstimatorChoice
+from articulate_ssl.training import shipped_weights
+from articulate_ssl.training.weights_file import write_weights
+from datamodules.point_cloud_io import PointCloudError
+from datamodules.shards import read_shard
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A data set, a checkpoint, and weights of two categories, one of them in both views."""
+    folder = tmp_path_factory.mktemp("load")
+    write_synthetic_set(folder)
+    module = tiny_module(steps=8, warmup_steps=6)
+    fit(module, folder, 8).save_checkpoint(folder / "trained.ckpt")
+    (folder / "weights").mkdir()
+    for name in ("laptop-complete", "laptop-depth", "oven-complete"):
+        module.hparams["category"] = name.split("-")[0]
+        write_weights(module, folder / "weights" / f"{name}.safetensors")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def package(folder, monkeypatch):
+    monkeypatch.setattr(shipped_weights, "WEIGHTS_FOLDER", folder / "weights")
+
+
+@pytest.fixture(scope="module")
+def cloud(folder):
+    shard = read_shard(next(folder.glob("laptop/*/test/*.npz")))
+    return shard["points"][0].astype(np.float64) * 40 + [5, 0, -3]
+
+
+def test_importing_the_package_imports_no_network() -> None:
+    code = "import sys, articulate_ssl; dir(articulate_ssl); print({'torch', 'lightning'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
+def test_the_package_offers_what_it_lists_and_nothing_else() -> None:
+    for name in articulate_ssl.__all__:
+        assert getattr(articulate_ssl, name).__name__ == name
+        assert name in dir(articulate_ssl)
+    with pytest.raises(AttributeError, match="no attribute 'laod'"):
+        _ = articulate_ssl.laod
+
+
+def test_arrays_tensors_and_files_are_predicted_alike(folder, cloud, tmp_path):
+    estimator = load(folder / "trained.ckpt")
+    np.save(tmp_path / "scan.npy", cloud)
+    clouds = [cloud, torch.from_numpy(cloud), cloud.tolist(), tmp_path / "scan.npy", str(tmp_path / "scan.npy")]
+    first, *others = estimator.predict_batch(clouds)
+    assert isinstance(first, ScanPrediction)
+    for other in others:
+        assert other.to_dict() == first.to_dict()
+        np.testing.assert_array_equal(other.part_id, first.part_id)
+    np.testing.assert_allclose(first.cloud, cloud)
+
+
+def test_the_answer_is_in_the_unit_of_the_scan(folder, cloud):
+    estimator = load(folder / "trained.ckpt")
+    small, large = estimator.predict(cloud), estimator.predict(cloud * 1000)
+    np.testing.assert_allclose(large.parts[0].pose[:3, 3], small.parts[0].pose[:3, 3] * 1000, rtol=1e-3, atol=5)
+    assert large.relative_error == pytest.approx(small.relative_error, rel=1e-3)
+
+
+def test_refinement_can_be_left_out(folder, cloud):
+    estimator = load(folder / "trained.ckpt")
+    default, rough = estimator.predict(cloud), estimator.predict(cloud, refine=False)
+    assert default.relative_error < rough.relative_error
+    assert estimator.predict(cloud, refine=True).to_dict() == default.to_dict()
+
+
+@pytest.mark.parametrize(
+    ("points", "problem"),
+    [(np.zeros((300, 2)), "expected one cloud"), (np.zeros((5, 3)), "at least 128"), (np.zeros((300, 3)), "coincide")],
+)
+def test_bad_points_are_refused(folder, points, problem):
+    with pytest.raises(PointCloudError, match=f"the points: .*{problem}"):
+        load(folder / "trained.ckpt").predict(points)
+
+
+def test_names_lead_to_one_or_several_sets_of_weights(folder):
+    assert load("oven").weights == "oven-complete"
+    assert load("laptop", view="depth").weights == "laptop-depth"
+    assert load("laptop-depth").category == "laptop"
+    both = load("laptop")
+    assert isinstance(both, EstimatorChoice) and both.category == "laptop"
+    assert [estimator.weights for estimator in both.estimators] == ["laptop-complete", "laptop-depth"]
+    assert len(load("auto").estimators) == 3 and load("auto").category == "auto"
+    assert [estimator.weights for estimator in load("auto", view="depth").estimators] == ["laptop-depth"]
+    path = folder / "trained.ckpt"
+    assert load(path).weights == str(path) and load(path).estimators[0].card is None
+
+
+def test_of_several_the_one_that_explains_the_scan_best_answers(folder, cloud):
+    choice = load("auto")
+    ignorant, *_ = choice.estimators
+    with torch.no_grad():
+        ignorant.module.articulated.category.template.mul_(5)  # far too large for any scan
+    found = choice.compare(cloud)
+    assert [result.checkpoint for result in found][-1] == ignorant.weights
+    assert choice.predict(cloud).to_dict() == found[0].to_dict()
+    assert choice.predict(cloud).checkpoint == found[0].checkpoint != ignorant.weights
+
+
+def test_estimators_move_to_devices(folder):
+    choice = load("auto").to("cpu")
+    assert choice.device == torch.device("cpu") == choice.estimators[-1].device
+    assert "oven-complete on cpu" in repr(choice) and "trained.ckpt on cpu" in repr(load(folder / "trained.ckpt"))
+
+
+def test_without_any_weights_the_error_says_how_to_make_them(tmp_path, monkeypatch):
+    monkeypatch.setattr(shipped_weights, "WEIGHTS_FOLDER", tmp_path)
+    with pytest.raises(CheckpointError, match="make weights"):
+        load("auto")
+    with pytest.raises(CheckpointError, match=r"laptop: neither a file nor .*make weights"):
+        load("laptop")
+
+
+def test_a_module_in_memory_is_an_estimator_too(folder, cloud):
+    module = ArticulatedPoseModule.from_pretrained(folder / "trained.ckpt")
+    direct = ArticulatedPoseEstimator(module, "in memory").predict(cloud)
+    assert direct.checkpoint == "in memory"
+    np.testing.assert_array_equal(direct.part_id, load(folder / "trained.ckpt").predict(cloud).part_id)
