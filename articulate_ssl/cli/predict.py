@@ -67,6 +67,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--check", action="store_true", help="let MuJoCo drop it and move its joints, and say how it went"
     )
+    parser.add_argument(
+        "--metres-per-unit",
+        type=float,
+        help="for --check: size of the scan's unit, .001 for millimetres (default: the object is taken to be half a "
+        "metre large)",
+    )
 
 
 def run(arguments: list[str]) -> int:
@@ -91,7 +97,7 @@ def run(arguments: list[str]) -> int:
         files = _write(candidates[0], out, args)
         _print_summary(candidates, files, limited)
         if args.check:
-            _print_check(out)
+            _print_check(out, args.metres_per_unit)
     except (PointCloudError, CheckpointError, ExportError, PhysicsCheckError, OSError) as error:
         print(f"articulate-ssl predict: {error}", file=sys.stderr)
         return BAD_INPUT
@@ -127,10 +133,10 @@ def _write(result: ScanPrediction, out: Path, args: argparse.Namespace) -> list[
     return files
 
 
-def _print_check(out: Path) -> None:
+def _print_check(out: Path, metres_per_unit: float | None) -> None:
     from articulate_ssl.inference.export import physics_check
 
-    print(*physics_check.check(out).lines(), sep="\n")
+    print(*physics_check.check(out, metres_per_unit).lines(), sep="\n")
 
 
 def _print_summary(candidates: list[ScanPrediction], files: list[Path], limited: bool) -> None:
@@ -145,7 +151,9 @@ def _print_summary(candidates: list[ScanPrediction], files: list[Path], limited:
         print("trained on views of an upright camera: the scan is taken to have its axes (x right, y down, z forward)")
     if best.probability is not None:
         print(f"probability that orientation and parts are right: {best.probability:.0%}")
-    if best.unlike is not None and len(candidates) == 1:
+    if best.warning:
+        console.print(f"[bold red]warning:[/] this scan is {best.warning}")
+    elif best.unlike is not None and len(candidates) == 1:
         print(f"{best.unlike:.0%} of the training clouds are explained better than this scan")
     print(f"reconstruction error {summary['reconstruction_error']:.4g} (in the unit of the scan)")
     print("wrote", *files, sep="\n  ")

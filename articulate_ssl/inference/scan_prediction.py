@@ -19,6 +19,7 @@ from articulate_ssl.inference.checkpoint_file import CheckpointError
 from articulate_ssl.inference.prediction import Prediction, ScanEstimate
 
 JOINT_TYPE_NAMES = ("revolute", "prismatic")
+UNLIKE = 0.99  # share of the training clouds that are explained better than a scan that is warned of
 
 
 @dataclass(frozen=True)
@@ -144,6 +145,16 @@ class ScanPrediction:
         """Reconstruction error over the size of the scan (mean distance of its points to their centre)."""
         size = np.linalg.norm(self.cloud - self.cloud.mean(axis=0), axis=1).mean()
         return float(self.prediction.reconstruction_error[0]) / float(size)
+
+    @property
+    def warning(self) -> str:
+        """About a scan that is unlike what the network was trained on; empty if there is nothing to say."""
+        if self.unlike is None or self.unlike < UNLIKE:
+            return ""
+        return (
+            f"explained worse than {UNLIKE:.0%} of the training clouds: it may be another object, cut off, cluttered, "
+            "or turned as none was; look before you use it"
+        )
 
     def articulate(
         self,

@@ -16,7 +16,10 @@ from datamodules.atomic import atomic_write
 JSON_NAME = "metrics.json"
 CSV_NAME = "metrics.csv"
 STATISTICS = ("mean", "median", "ci95")
-PERCENT = ("flip_rate", "above_30_rate", "seg_miou", "tree_accuracy", "root_accuracy", "legacy_seg_miou")
+PERCENT = (
+    *("flip_rate", "above_30_rate", "seg_miou", "tree_accuracy", "root_accuracy", "legacy_seg_miou"),
+    *("repeat_above_30_rate", "repeat_miou", "part_share", "probability", "margin"),
+)
 
 
 def rows(metrics: dict) -> Iterator[tuple[str, str, dict]]:

@@ -256,7 +256,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         batches = [self._whole(self.transfer_batch_to_device(batch, self.device, 0)) for batch in loader]
         shown = announced(log, "calibration on training clouds", batches)
         predictions = [self.predict_points(split_labels(batch)[0]["points"]) for batch in shown]
-        self.test_report = TestReport(predictions, batches).to(self.device)
+        self.test_report = TestReport(predictions, batches, self.orientation.limited).to(self.device)
 
     def test_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
         """Predict, then compare."""

@@ -16,6 +16,7 @@ from articulate_ssl.inference.confidence import relative_error
 from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.metrics.functional import ABOVE_DEG
 from articulate_ssl.ops.farthest_point import farthest_point_order
+from articulate_ssl.ops.progress import announced
 
 if TYPE_CHECKING:
     from articulate_ssl.training.module import ArticulatedPoseModule
@@ -83,7 +84,7 @@ def look_twice(
     generator = torch.Generator().manual_seed(0)
     count = max(module.num_points, module.inference.points)
     found = []
-    for some in clouds.split(_BATCH):
+    for some in announced(log, "learning confidence", clouds.split(_BATCH)):
         again, turn = another_look(some, module.orientation.limited, generator)
         points = some[:, :count], again[:, :count]
         first, second = (module.predict_points(p) for p in points)

@@ -30,16 +30,17 @@ class TestReport:
     Args:
         predictions: Of the calibration clouds, batch by batch.
         batches: Those clouds with their labels.
+        upright: Whether canonical object space tells up and front, for the picture.
     """
 
     __test__ = False  # not a pytest class
 
-    def __init__(self, predictions: list[Prediction], batches: list[dict[str, Tensor]]) -> None:
+    def __init__(self, predictions: list[Prediction], batches: list[dict[str, Tensor]], upright: bool) -> None:
         labels = {name: torch.cat([batch[name] for batch in batches]) for name in batches[0]}
         self.calibration = calibrate(concatenate(predictions), labels)
         self.metrics = ArticulatedPoseMetrics(self.calibration)
         self.samples: list[tuple[Tensor, Tensor, Prediction]] = []
-        self.seconds = 0.0
+        self.seconds, self.upright = 0.0, upright
 
     def to(self, device: torch.device) -> TestReport:
         """Move calibration and metric states."""
@@ -101,5 +102,5 @@ class TestReport:
         for name, index in (("best", order[0]), ("median", order[len(order) // 2]), ("worst", order[-1])):
             i = int(index)
             title = f"{name}: mean R error {error[i]:.1f}°"
-            rows.append(SampleRow(title, points[i].numpy(), prediction[i : i + 1], truth[i].numpy()))
+            rows.append(SampleRow(title, points[i].numpy(), prediction[i : i + 1], truth[i].numpy(), self.upright))
         draw_test_samples(rows, path)

@@ -1,7 +1,7 @@
 """Poses, joint states and joint lines of all clouds of one object at once: point to plane, between all clouds.
 
 What bundle adjustment is to photographs. Every point is brought to canonical object space with the part it belongs to,
-and pulled onto the plane of its nearest neighbour from another cloud.
+and pulled onto the plane of its nearest neighbour in a few of the other clouds.
 """
 
 from __future__ import annotations
@@ -18,11 +18,21 @@ from articulate_ssl.discovery.one_object.surface import Surface
 from articulate_ssl.geometry.se3 import invert_se3, se3
 from articulate_ssl.shape.joints import Joints
 
-_NEIGHBOURS = 8  # candidates among which one of another cloud is looked for
+_PARTNERS = 4  # clouds that each cloud is matched with, others in every matching
+_NEIGHBOURS = 4  # candidates among which one with a like normal is looked for
 _ALIKE = 0.8  # least cosine between normals
 _ITERATIONS = 12  # of L-BFGS between two matchings
-_FARTHEST = (0.06, 0.03, 0.015, 0.015)  # normalised units: matches beyond are none, matching by matching
-_SOFT = 0.003  # normalised units: residuals beyond count linearly
+_FARTHEST = (
+    0.1,
+    0.06,
+    0.06,
+    0.03,
+    0.03,
+    0.015,
+    0.015,
+    0.015,
+)  # normalised units: matches beyond are none, matching by matching
+_SOFTER = 5.0  # residuals beyond that part of the farthest match count linearly
 
 
 @dataclass(frozen=True)
@@ -54,8 +64,10 @@ def adjusted(
     points = torch.from_numpy(np.stack([s.points for s in surfaces]))
     normals = torch.from_numpy(np.stack([s.normals for s in surfaces]))
     part = torch.from_numpy(label)
+    generator = np.random.default_rng(0)
     for farthest in _FARTHEST:
-        placed = _descended(placed, points, part, *_matches(placed.pose, points, normals, part, farthest))
+        matches = _matches(placed.pose, points, normals, part, farthest, generator)
+        placed = _descended(placed, points, part, *matches, soft=farthest / _SOFTER)
     return placed
 
 
@@ -66,31 +78,40 @@ def _canonical(pose: Tensor, points: Tensor, part: Tensor) -> Tensor:
 
 
 def _matches(
-    pose: Tensor, points: Tensor, normals: Tensor, part: Tensor, farthest: float
+    pose: Tensor, points: Tensor, normals: Tensor, part: Tensor, farthest: float, generator: np.random.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:  # [m], [m], [m, 3]
-    """Flat indices of points and of their matches, and the matches' normals in canonical object space."""
+    """Flat indices of points and of their matches, and the matches' normals in canonical object space.
+
+    Each cloud is matched with a few others, one by one. The nearest of all clouds' points would be near by chance, and
+    the pull towards it none.
+    """
     n, count = points.shape[:2]
     with torch.no_grad():
-        flat = _canonical(pose, points, part).flatten(0, 1).numpy()
+        flat = _canonical(pose, points, part).numpy()
         turned = torch.zeros_like(pose)
         turned[..., :3, :3], turned[..., 3, 3] = pose[..., :3, :3], 1
-        normal = _canonical(turned, normals, part).flatten(0, 1).numpy()
-    owner, piece = np.repeat(np.arange(n), count), part.flatten().numpy()
+        normal = _canonical(turned, normals, part).numpy()
+    # Parts far apart in a fourth coordinate, so that one query finds neighbours in the same part only.
+    label = part.numpy()
+    apart = np.concatenate([flat, 10.0 * label[..., None]], axis=-1)
+    trees = [cKDTree(one) for one in apart]
     ones, others = [], []
-    for k in np.unique(piece):
-        mine = np.flatnonzero(piece == k)
-        distance, index = cKDTree(flat[mine]).query(flat[mine], k=min(n + _NEIGHBOURS, len(mine)))
-        index = mine[index]
-        fits = (owner[index] != owner[mine, None]) & (distance < farthest)
-        fits &= np.abs(np.einsum("mki,mi->mk", normal[index], normal[mine])) > _ALIKE
-        some, first = fits.any(axis=1), fits.argmax(axis=1)
-        ones.append(mine[some])
-        others.append(index[some, first[some]])
-    match = np.concatenate(others)
-    return torch.from_numpy(np.concatenate(ones)), torch.from_numpy(match), torch.from_numpy(normal[match])
+    for shift in generator.permutation(np.arange(1, n))[:_PARTNERS]:
+        for i in range(n):
+            j = (i + shift) % n
+            distance, index = trees[j].query(apart[i], k=_NEIGHBOURS, distance_upper_bound=farthest)
+            index = np.minimum(index, count - 1)  # where there is no neighbour, its distance is infinite
+            fits = np.isfinite(distance) & (np.abs(np.einsum("mki,mi->mk", normal[j][index], normal[i])) > _ALIKE)
+            some, first = fits.any(axis=1), fits.argmax(axis=1)
+            ones.append(i * count + np.flatnonzero(some))
+            others.append(j * count + index[some, first[some]])
+    one, other = torch.from_numpy(np.concatenate(ones)), torch.from_numpy(np.concatenate(others))
+    return one, other, torch.from_numpy(normal).flatten(0, 1)[other]
 
 
-def _descended(placed: Placed, points: Tensor, part: Tensor, one: Tensor, other: Tensor, normal: Tensor) -> Placed:
+def _descended(
+    placed: Placed, points: Tensor, part: Tensor, one: Tensor, other: Tensor, normal: Tensor, soft: float
+) -> Placed:
     free = [torch.zeros_like(v, requires_grad=True) for v in (placed.base[:, 0, :3], placed.base[:, 0, :3])]
     free += [torch.zeros_like(v, requires_grad=True) for v in (placed.state, placed.joints.axis, placed.joints.pivot)]
     optimizer = torch.optim.LBFGS(free, max_iter=_ITERATIONS, line_search_fn="strong_wolfe")
@@ -99,7 +120,7 @@ def _descended(placed: Placed, points: Tensor, part: Tensor, one: Tensor, other:
         optimizer.zero_grad()
         flat = _canonical(_moved(placed, *free).pose, points, part).flatten(0, 1)
         residual = ((flat[one] - flat[other]) * normal).sum(dim=-1)
-        value = torch.nn.functional.huber_loss(residual / _SOFT, torch.zeros_like(residual))
+        value = torch.nn.functional.huber_loss(residual / soft, torch.zeros_like(residual))
         value.backward()
         return value
 

@@ -7,7 +7,9 @@ Convention of `prediction.json` (schema 1):
     `axis` and `pivot` live in the frame of the scan, `canonical_axis` and `canonical_pivot` in the canonical object
     space; `state` and `limits` are relative to the canonical object shape. `reconstruction_error` and
     `kinematic_error` are lengths. `margin` is how much better, from 0 to 1, the prediction fits than the best rival
-    that is turned another way; it is no probability. (scan - center) / scale is what the network saw.
+    that is turned another way; it is no probability. `probability` is one, learnt without labels, and `unlike` the
+    share of the training clouds that were explained better (both null if not learnt); `warning` says so where it is
+    large. (scan - center) / scale is what the network saw.
 """
 
 from __future__ import annotations
@@ -51,6 +53,9 @@ def describe(result: ScanPrediction) -> dict:
         "reconstruction_error": float(prediction.reconstruction_error[0]),
         "kinematic_error": kinematic_error(prediction),
         "margin": float(prediction.margin[0]),
+        "probability": result.probability,
+        "unlike": result.unlike,
+        "warning": result.warning,
         "category": result.category,
         "checkpoint": result.checkpoint,
         "center": list(map(float, result.center)),

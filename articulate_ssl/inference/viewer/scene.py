@@ -94,7 +94,7 @@ def scene_of(result: ScanPrediction) -> Scene:
         scale=float(result.scale),
         level=level_frame(result.prediction, result.limits, result.upright) @ to_canonical,
         hypotheses=tuple(found),
-        warning=_warning(result),
+        warning=f"This scan is {result.warning}." if result.warning else "",
     )
 
 
@@ -136,10 +136,3 @@ def _confidence(result: ScanPrediction) -> str:
 
 def _rival_confidence(result: ScanPrediction) -> str:
     return "less likely" if result.probability is None else f"at most {1 - result.probability:.0%}"
-
-
-def _warning(result: ScanPrediction) -> str:
-    # One in twenty training clouds is warned about too; chosen without a measurement.
-    if result.unlike is None or result.unlike < 0.95:
-        return ""
-    return f"Unlike the clouds of the training: {result.unlike:.0%} of them were explained better than this scan."

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import roma
 import torch
-from articulated_objects import LAPTOP, clouds
+from articulated_objects import OVEN, clouds
 
 from articulate_ssl.discovery.one_object.adjustment import Placed, adjusted
 from articulate_ssl.discovery.one_object.surface import Surface
@@ -16,8 +16,8 @@ from articulate_ssl.shape.joints import Joints
 
 @pytest.fixture(scope="module")
 def world():
-    data = clouds(LAPTOP, count=8, points=1024, resample=True, seed=1)
-    joints = Joints(KinematicChain(2, 0, (0,), (1,)), data.axis.double(), data.pivot.double(), LAPTOP[4])
+    data = clouds(OVEN, count=8, points=2048, resample=True, seed=1)
+    joints = Joints(KinematicChain(2, 0, (0,), (1,)), data.axis.double(), data.pivot.double(), OVEN[4])
     truth = Placed(joints, data.base.double(), data.state.double())
     surfaces = [Surface.of(cloud) for cloud in data.points.double().numpy()]
     return truth, surfaces, data.part.repeat(8, 1).numpy()
@@ -36,7 +36,7 @@ def _disturbed(truth: Placed) -> Placed:
 
 
 def _motion_error(placed: Placed, truth: Placed) -> float:
-    """Degrees by which the lid is turned wrongly against the base, mean over the clouds, whatever the frame."""
+    """Degrees by which the door is turned wrongly against the body, mean over the clouds, whatever the frame."""
     relative = [(p.pose[:, 0, :3, :3].mT @ p.pose[:, 1, :3, :3]) for p in (placed, truth)]
     # Parts have no common rest state: motions from the first cloud to the others are compared.
     first, second = (r[0] @ r.mT for r in relative)
@@ -57,7 +57,7 @@ def test_joint_lines_come_back_too(world):
     found = adjusted(_disturbed(truth), surfaces, part)
     axis = (found.base[:, :3, :3] @ found.joints.axis[0], truth.base[:, :3, :3] @ truth.joints.axis[0])
     degrees = (axis[0] * axis[1]).sum(dim=-1).abs().clamp(max=1).acos().rad2deg()
-    assert degrees.max() < 0.5
+    assert degrees.max() < 1
 
 
 def test_with_labels_exchanged_nothing_comes_back(world):

@@ -4,10 +4,18 @@ from itertools import permutations
 
 import pytest
 import torch
-from articulated_objects import DRAWER, LAPTOP, clouds
+from articulated_objects import DRAWER, OVEN, clouds
 
 from articulate_ssl.discovery.discover import DiscoveryError
+from articulate_ssl.discovery.one_object import find
 from articulate_ssl.discovery.one_object.find import MIN_CLOUDS, find_one_object
+
+
+@pytest.fixture(autouse=True)
+def little_effort(monkeypatch):
+    """These objects are simple."""
+    monkeypatch.setattr(find, "_EFFORT", {"starts": 3, "jointed": 2, "rounds": 1, "cycles": 3, "edge_hinges": False})
+    monkeypatch.setattr(find, "_REFERENCES", (1,))
 
 
 def _mean_iou(found: torch.Tensor, true: torch.Tensor, num_parts: int) -> float:
@@ -18,9 +26,9 @@ def _mean_iou(found: torch.Tensor, true: torch.Tensor, num_parts: int) -> float:
     return max(map(iou, permutations(range(num_parts))))
 
 
-@pytest.mark.parametrize(("design", "least"), [(LAPTOP, 0.95), (DRAWER, 0.9)], ids=["laptop", "drawer"])
+@pytest.mark.parametrize(("design", "least"), [(OVEN, 0.92), (DRAWER, 0.9)], ids=["oven", "drawer"])
 def test_parts_states_and_joints_are_exact(design, least):
-    data = clouds(design, count=8, points=1024, resample=True, seed=1)
+    data = clouds(design, count=8, points=2048, resample=True, seed=1)
     found = find_one_object(data.points, 2, design[4], part_points=256)
     assert _mean_iou(found.label, data.part.expand_as(found.label), 2) > least
     assert torch.corrcoef(torch.stack([found.state[:, 0], data.state[:, 0].double()]))[0, 1].abs() > 0.999
@@ -30,17 +38,17 @@ def test_parts_states_and_joints_are_exact(design, least):
     assert (axis * truth).sum(dim=-1).abs().clamp(max=1).acos().rad2deg().max() < 1.5
     assert joints.limits.tolist() == [[found.state.min().item(), found.state.max().item()]]
     assert torch.bincount(found.shape.label).tolist() == [256, 256]
-    assert found.unexplained < 0.1
+    assert found.unexplained < find._EXPLAINED
 
 
 def test_too_few_clouds_are_refused():
-    data = clouds(LAPTOP, count=MIN_CLOUDS - 1, points=64)
+    data = clouds(OVEN, count=MIN_CLOUDS - 1, points=64)
     with pytest.raises(DiscoveryError, match="7 clouds of one object, at least 8"):
-        find_one_object(data.points, 2, LAPTOP[4])
+        find_one_object(data.points, 2, OVEN[4])
 
 
 def test_an_object_that_does_not_move_is_refused():
-    data = clouds(LAPTOP, count=8, points=256, resample=True)
+    data = clouds(OVEN, count=8, points=128, resample=True)
     still = data.points[:1].repeat(8, 1, 1)
     with pytest.raises(DiscoveryError, match="parts"):
-        find_one_object(still, 2, LAPTOP[4])
+        find_one_object(still, 2, OVEN[4])

@@ -11,7 +11,7 @@ from articulate_ssl.shape.joints import Joints
 
 def _world() -> tuple[list[Surface], np.ndarray, np.ndarray]:
     """Clouds of a drawer, the poses of its parts, and the parts of the points."""
-    data = clouds(DRAWER, count=8, points=1024, resample=True, seed=1)
+    data = clouds(DRAWER, count=8, points=2048, resample=True, seed=1)
     joints = Joints(KinematicChain(2, 0, (0,), (1,)), data.axis, data.pivot, DRAWER[4])
     pose = joints.part_pose(data.base, data.state).double().numpy()
     return [Surface.of(cloud) for cloud in data.points.double().numpy()], pose, data.part.numpy()
@@ -19,17 +19,17 @@ def _world() -> tuple[list[Surface], np.ndarray, np.ndarray]:
 
 def test_what_moves_is_told_from_what_stays():
     surfaces, pose, part = _world()
-    cost = moving_costs(surfaces, pose, 1024)
-    assert cost.shape == (8, 1024, 2)
+    cost = moving_costs(surfaces, pose, 2048)
+    assert cost.shape == (8, 2048, 2)
     own = np.take_along_axis(cost, part[None, :, None].repeat(8, axis=0), axis=2)
     assert np.median(own) < 0.002
-    exchanged = moving_costs(surfaces, pose[:, ::-1], 1024)
+    exchanged = moving_costs(surfaces, pose[:, ::-1], 2048)
     np.testing.assert_allclose(exchanged, cost[..., ::-1], atol=1e-12)
 
 
 def test_labels_that_spread_along_faces_are_better_than_those_of_single_points():
     surfaces, pose, part = _world()
-    cost = moving_costs(surfaces, pose, 1024)
+    cost = moving_costs(surfaces, pose, 2048)
     alone = (cost.argmin(axis=-1) == part).mean()
     probability = np.stack([spread_labels(s, c) for s, c in zip(surfaces, cost, strict=True)])
     np.testing.assert_allclose(probability.sum(axis=-1), 1, atol=1e-9)
