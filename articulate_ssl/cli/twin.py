@@ -81,7 +81,10 @@ def _twin(args: argparse.Namespace) -> None:
     for name, state in zip(names, twin.states, strict=True):
         table.add_row(name, *(f"{math.degrees(s):.1f}°" if args.joint == "revolute" else f"{s:.4g}" for s in state))
     Console().print(table)
-    print(f"scans lie {100 * twin.misfit:.1f} % of the object's size from what was found, in the median")
+    print(
+        f"scans lie on one another up to {twin.misfit:.2%} of the object's size in the median; "
+        f"{twin.unexplained:.0%} of their points are off whichever part they move with"
+    )
     print(f"wrote, as {names[0]} shows it:", *files, sep="\n  ")
     if args.check:
         from articulate_ssl.inference.export import physics_check

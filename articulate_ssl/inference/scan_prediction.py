@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from articulate_ssl.geometry.screw import PRISMATIC
 from articulate_ssl.inference.articulation import articulate, posed_parts, to_input_frame
 from articulate_ssl.inference.checkpoint_file import CheckpointError
 from articulate_ssl.inference.prediction import Prediction, ScanEstimate
+from articulate_ssl.ops.kd_tree import kd_tree
 
 JOINT_TYPE_NAMES = ("revolute", "prismatic")
 UNLIKE = 0.99  # share of the training clouds that are explained better than a scan that is warned of
@@ -208,7 +208,7 @@ def part_of_points(
     cloud: np.ndarray,  # [M, 3] the whole scan, same frame as `points`
 ) -> np.ndarray:  # [M] part indices
     """Part of every point of the whole scan: that of the nearest point that the network saw."""
-    return prediction.part_id[0].cpu().numpy()[cKDTree(points).query(cloud)[1]]
+    return prediction.part_id[0].cpu().numpy()[kd_tree(points).query(cloud)[1]]
 
 
 def in_scan_frame(

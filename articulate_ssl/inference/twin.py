@@ -26,7 +26,7 @@ from datamodules.atomic import atomic_write
 
 CATEGORY = "twin"  # what predictions and exports call an object that is its own category
 STATES_FILE = "states.json"
-_POINTS = 4096  # of every scan that are read
+_POINTS = 4096  # of every scan, at most, that are read
 _JOINT_TYPES = {"revolute": REVOLUTE, "prismatic": PRISMATIC}
 
 
@@ -37,20 +37,18 @@ class Twin:
     Attributes:
         scans: One prediction per scan, each in the frame of its scan; parts, canonical shapes and joints are the same
             in all, states and poses differ. `limits` are the lowest and highest state that any scan shows.
+        misfit: Median distance of the scans from one another, each part moved as found, over the size of the object.
+        unexplained: Share of the points that are off whichever part they are moved with (`OneObject.unexplained`).
     """
 
     scans: tuple[ScanPrediction, ...]
+    misfit: float
+    unexplained: float
 
     @property
     def states(self) -> np.ndarray:
         """[n, J] joint states of every scan: radians, or lengths in the units of the scans."""
         return torch.cat([scan.prediction.joint_state for scan in self.scans]).numpy()
-
-    @property
-    def misfit(self) -> float:
-        """Median distance of the scans to their reconstructions, over the size of the object."""
-        scan = self.scans[0]
-        return float(np.median([s.prediction.reconstruction_error[0] for s in self.scans]) / scan.scale)
 
     def export(self, folder: Path, names: Sequence[str], scan: int = 0, formats: Sequence[str] | None = None) -> list:
         """Write the object as one scan shows it (`ScanPrediction.export`), and `states.json`, the states of all.
@@ -99,10 +97,13 @@ def find_twin(
     if num_parts < 2:
         raise ValueError(f"num_parts must be at least 2, got {num_parts}")
     scale = float(np.median([normalise_cloud(cloud, 1)[2] for cloud in clouds])) if len(clouds) else 1.0
-    read = [normalise_cloud(cloud, _POINTS, scale=scale) for cloud in clouds]
-    points = torch.from_numpy(np.stack([one for one, _, _ in read])) if read else torch.zeros(0, _POINTS, 3)
+    # As many of each, and none twice, which would have no normal.
+    count = min([_POINTS, *map(len, clouds)])
+    read = [normalise_cloud(cloud, count, scale=scale) for cloud in clouds]
+    points = torch.from_numpy(np.stack([one for one, _, _ in read])) if read else torch.zeros(0, count, 3)
     found = find_one_object(points, num_parts, _JOINT_TYPES[joint], seed=seed)
-    return Twin(tuple(_scan(found, i, points[i], cloud, read[i][1], scale) for i, cloud in enumerate(clouds)))
+    scans = tuple(_scan(found, i, points[i], cloud, read[i][1], scale) for i, cloud in enumerate(clouds))
+    return Twin(scans, float(found.misfit.median()), found.unexplained)
 
 
 def _scan(

@@ -12,8 +12,9 @@ import numpy as np
 import roma
 import torch
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial import cKDTree
 from torch import Tensor
+
+from articulate_ssl.ops.kd_tree import kd_tree
 
 PARALLEL_BELOW = math.radians(1.0)
 SKEW_ABOVE = math.radians(5.0)
@@ -103,7 +104,7 @@ def nearest_index(
     """Distance to, and index of, the nearest of `points` for every query point."""
     # k-d trees on the CPU: five times faster than a dense table there, and exact where matrix products lose digits.
     pairs = [
-        cKDTree(p).query(q) for q, p in zip(query.double().cpu().numpy(), points.double().cpu().numpy(), strict=True)
+        kd_tree(p).query(q) for q, p in zip(query.double().cpu().numpy(), points.double().cpu().numpy(), strict=True)
     ]
     distance, index = (torch.from_numpy(np.stack(values)).to(query.device) for values in zip(*pairs, strict=True))
     return distance, index

@@ -23,13 +23,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.metrics.functional import axis_angle_error, point_to_line_distance, rotation_error
+from articulate_ssl.ops.kd_tree import kd_tree
 
 # Lengths are in units of the object's diagonal.
 GRID_EDGE = 0.01  # 5,000 points on a typical part: a tenth of a second per instance
@@ -168,7 +168,7 @@ def _keeps_surface(
     kept = torch.zeros(len(candidates), dtype=torch.bool)
     if len(second) == 0:
         return kept
-    trees = cKDTree(first), cKDTree(second)
+    trees = kd_tree(first), kd_tree(second)
 
     def distances(rotation: np.ndarray) -> np.ndarray:  # mean, and mean of the tail
         there, back = trees[1].query(first @ rotation)[0], trees[0].query(second @ rotation.T)[0]

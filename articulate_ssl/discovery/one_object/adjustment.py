@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import roma
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from articulate_ssl.discovery.one_object.surface import Surface
 from articulate_ssl.geometry.se3 import invert_se3, se3
+from articulate_ssl.ops.kd_tree import kd_tree
 from articulate_ssl.shape.joints import Joints
 
 _PARTNERS = 4  # clouds that each cloud is matched with, others in every matching
@@ -94,7 +94,7 @@ def _matches(
     # Parts far apart in a fourth coordinate, so that one query finds neighbours in the same part only.
     label = part.numpy()
     apart = np.concatenate([flat, 10.0 * label[..., None]], axis=-1)
-    trees = [cKDTree(one) for one in apart]
+    trees = [kd_tree(one) for one in apart]
     ones, others = [], []
     for shift in generator.permutation(np.arange(1, n))[:_PARTNERS]:
         for i in range(n):

@@ -12,6 +12,8 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
+from articulate_ssl.ops.kd_tree import kd_tree
+
 _NORMAL_NEIGHBOURS = 12
 _NEIGHBOURS = 6  # surface samples that a query is compared with
 _ALIKE = 0.8  # least cosine between the normals of a query and a sample on the same face
@@ -34,14 +36,14 @@ class Surface:
     @staticmethod
     def of(points: np.ndarray) -> Surface:
         """Normals from the plane of least squares through every point's neighbours."""
-        around = points[cKDTree(points).query(points, k=_NORMAL_NEIGHBOURS)[1]]
+        around = points[kd_tree(points).query(points, k=_NORMAL_NEIGHBOURS)[1]]
         around = around - around.mean(axis=1, keepdims=True)
         return Surface(points, np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))[1][..., 0])
 
     @cached_property
     def tree(self) -> cKDTree:
         """Of the points."""
-        return cKDTree(self.points)
+        return kd_tree(self.points)
 
     @cached_property
     def spacing(self) -> float:

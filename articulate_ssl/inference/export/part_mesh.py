@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import trimesh
-from scipy.spatial import cKDTree
+
+from articulate_ssl.ops.kd_tree import kd_tree
 
 HULL_SLACK = 2.5
 ALPHA_RADII = (1.5, 1.75, 2.0, 2.25, 2.5, 3.0, 4.0, 6.0)
@@ -43,7 +44,7 @@ def _mesh_of_unit_size(
     hull = trimesh.convex.convex_hull(solid)
     if len(solid) > len(points):
         return hull
-    tree = cKDTree(points)
+    tree = kd_tree(points)
     spacing = float(np.median(tree.query(points, k=2)[0][:, 1]))
     gaps = tree.query(trimesh.sample.sample_surface(hull, 2000, seed=0)[0])[0]
     if gaps.max() <= HULL_SLACK * spacing:

@@ -13,7 +13,6 @@ from matplotlib.collections import TriMesh
 from matplotlib.figure import Figure
 from matplotlib.patheffects import Normal, Stroke
 from matplotlib.tri import Triangulation
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from articulate_ssl.geometry.screw import PRISMATIC
@@ -25,6 +24,7 @@ from articulate_ssl.inference.pictures.part_colour import part_colour
 from articulate_ssl.inference.pictures.surface import LitTriangles, Surface, cut_small, lit_triangles
 from articulate_ssl.inference.pictures.viewpoint import viewing_rotation
 from articulate_ssl.inference.prediction import Prediction
+from articulate_ssl.ops.kd_tree import kd_tree
 from datamodules.atomic import atomic_write
 
 PANEL_INCHES = 2.6
@@ -220,7 +220,7 @@ def _lambert(
     shape: np.ndarray,  # [N, 3] one part
 ) -> tuple[np.ndarray, float]:
     """Brightness [N] of the points' local planes in light from the upper left, both sides alike; and point spacing."""
-    distance, index = cKDTree(shape).query(shape, k=range(1, min(16, len(shape)) + 1))
+    distance, index = kd_tree(shape).query(shape, k=range(1, min(16, len(shape)) + 1))
     spread = shape[index] - shape[index].mean(axis=1, keepdims=True)
     normal = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))[1][:, :, 0]
     normal = np.where(normal[:, 2:] < 0, -normal, normal)

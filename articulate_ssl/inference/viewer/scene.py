@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 import trimesh
-from scipy.spatial import cKDTree
 
 from articulate_ssl.inference.articulation import part_motion, posed_parts
 from articulate_ssl.inference.export.rigid_links import RigidJoint, rigid_object
@@ -16,6 +15,7 @@ from articulate_ssl.inference.pictures.surface import smooth_shaded
 from articulate_ssl.inference.pictures.viewpoint import level_frame
 from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.inference.scan_prediction import ScanPrediction
+from articulate_ssl.ops.kd_tree import kd_tree
 
 # Enough to close surfaces on a screen; chosen without a measurement. More make the page slow to open and to turn.
 MAX_SHOWN_POINTS = 20_000
@@ -123,7 +123,7 @@ def _part_of(
 ) -> np.ndarray:  # [S]
     """The part whose reconstruction is nearest: a rival labels only the points that the network saw."""
     shapes = posed_parts(prediction)[0].numpy()
-    return cKDTree(shapes.reshape(-1, 3)).query(points)[1] // shapes.shape[1]
+    return kd_tree(shapes.reshape(-1, 3)).query(points)[1] // shapes.shape[1]
 
 
 def _confidence(result: ScanPrediction) -> str:

@@ -5,6 +5,7 @@ from itertools import permutations
 import pytest
 import torch
 from articulated_objects import DRAWER, OVEN, clouds
+from twin_objects import with_little_effort
 
 from articulate_ssl.discovery.discover import DiscoveryError
 from articulate_ssl.discovery.one_object import find
@@ -14,8 +15,7 @@ from articulate_ssl.discovery.one_object.find import MIN_CLOUDS, find_one_object
 @pytest.fixture(autouse=True)
 def little_effort(monkeypatch):
     """These objects are simple."""
-    monkeypatch.setattr(find, "_EFFORT", {"starts": 3, "jointed": 2, "rounds": 1, "cycles": 3, "edge_hinges": False})
-    monkeypatch.setattr(find, "_REFERENCES", (1,))
+    with_little_effort(monkeypatch)
 
 
 def _mean_iou(found: torch.Tensor, true: torch.Tensor, num_parts: int) -> float:

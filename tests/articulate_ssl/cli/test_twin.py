@@ -1,0 +1,46 @@
+"""`articulate-ssl twin`: from scans of one object to a folder of results."""
+
+import json
+
+import numpy as np
+import pytest
+from twin_objects import drawer, scans, with_little_effort
+
+from articulate_ssl.cli import main
+
+
+@pytest.fixture
+def scan_files(tmp_path, monkeypatch):
+    with_little_effort(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    names = [f"{i}.npy" for i in range(8)]
+    for name, cloud in zip(names, scans(drawer()), strict=True):
+        np.save(name, cloud)
+    return names
+
+
+def test_scans_become_a_folder(scan_files, tmp_path, capsys):
+    assert main(["twin", *scan_files, "--parts", "2", "--joint", "prismatic", "--html"]) == 0
+    out = capsys.readouterr().out
+    assert "joint states (prismatic)" in out and "7.npy" in out
+    assert {"prediction.json", "object.urdf", "object.glb", "states.json", "view.html"} <= {
+        path.name for path in (tmp_path / "twin").iterdir()
+    }
+    assert list(json.loads((tmp_path / "twin" / "states.json").read_text())) == scan_files
+
+
+def test_too_few_scans_are_refused(scan_files, tmp_path, capsys):
+    assert main(["twin", *scan_files[:3], "--parts", "2"]) == 2
+    assert "3 clouds of one object, at least 8 are needed" in capsys.readouterr().err
+    assert not (tmp_path / "twin").exists()
+
+
+def test_a_damaged_scan_is_named(scan_files, tmp_path, capsys):
+    (tmp_path / "bad.npy").write_bytes(b"no numbers")
+    assert main(["twin", *scan_files, "bad.npy", "--parts", "2"]) == 2
+    assert "bad.npy: damaged" in capsys.readouterr().err
+
+
+def test_one_part_does_not_move(scan_files):
+    with pytest.raises(SystemExit, match="2"):
+        main(["twin", *scan_files, "--parts", "1"])
