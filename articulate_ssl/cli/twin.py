@@ -77,7 +77,7 @@ def _twin(args: argparse.Namespace) -> None:
         from articulate_ssl.inference.viewer import html_page
 
         files += html_page.write(twin.scans[0], args.out)
-    table = Table("scan", *(joint.name for joint in twin.scans[0].joints), title=f"joint states ({args.joint})")
+    table = Table("scan", *(joint.name for joint in twin.scans[0].joints), title="joint states")
     for name, state in zip(names, twin.states, strict=True):
         table.add_row(name, *(f"{math.degrees(s):.1f}°" if args.joint == "revolute" else f"{s:.4g}" for s in state))
     Console().print(table)

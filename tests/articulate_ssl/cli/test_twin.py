@@ -22,7 +22,7 @@ def scan_files(tmp_path, monkeypatch):
 def test_scans_become_a_folder(scan_files, tmp_path, capsys):
     assert main(["twin", *scan_files, "--parts", "2", "--joint", "prismatic", "--html"]) == 0
     out = capsys.readouterr().out
-    assert "joint states (prismatic)" in out and "7.npy" in out
+    assert "joint states" in out and "7.npy" in out
     assert {"prediction.json", "object.urdf", "object.glb", "states.json", "view.html"} <= {
         path.name for path in (tmp_path / "twin").iterdir()
     }
