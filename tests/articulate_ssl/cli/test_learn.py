@@ -190,8 +190,8 @@ def test_curves_and_pictures_go_to_weights_and_biases_if_asked_for(run, workplac
         wandb.finish()
     wandb.teardown()  # not until then is everything written
     sent = [path.read_bytes() for path in root.glob("wandb/offline-run-*/run-*.wandb")]
-    curves, results = sorted(sent, key=lambda content: b"test_samples" in content)
-    assert b"articulate-ssl" in curves and b"state_spread" in curves and b"test/seg_miou" not in curves
+    curves, results = sorted(sent, key=lambda content: b"test/seg_miou" in content)
+    assert b"articulate-ssl" in curves and b"state_spread" in curves and b"mine" not in curves
     assert all(name in results for name in (b"mine", b"test/r_err_deg", b"test/seg_miou", b"test_samples"))
     assert len(list(root.glob("wandb/offline-run-*/files/media/images/*.png"))) == 1
     (config,) = root.glob("lightning_logs/version_0/config.yaml")  # the run's folder is where it was without the flag
