@@ -9,6 +9,7 @@ import argparse
 import math
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from rich.console import Console
@@ -17,14 +18,18 @@ from rich.table import Table
 
 from articulate_ssl.cli import BAD_INPUT
 from articulate_ssl.inference.checkpoint_file import CheckpointError
-from articulate_ssl.inference.export.folder import EXPORTERS_BY_NAME, ExportError, exporters_named
+from articulate_ssl.inference.export.folder import EXPORTERS_BY_NAME, ON_REQUEST, ExportError, exporters_named
 from articulate_ssl.inference.export.physics_check import PhysicsCheckError
 from articulate_ssl.inference.scan_prediction import ScanPrediction
 from articulate_ssl.training.shipped_weights import shipped_weights
-from articulate_ssl.training.weights_card import VIEWS
+from articulate_ssl.training.weights_card import VIEWS, WeightsCard
 from datamodules.point_cloud_io import PointCloudError, load_point_cloud
 
+if TYPE_CHECKING:
+    from articulate_ssl.pretrained.estimator import ArticulatedPoseEstimator
+
 AUTO = "auto"
+OFTEN_WRONG = 0.05  # share of the test clouds beyond which weights are warned of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -61,7 +66,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--formats",
         type=_formats,
-        help=f"what to write, with commas between: {', '.join(EXPORTERS_BY_NAME)} (default: all that can be written)",
+        help=f"what to write, with commas between: {', '.join(EXPORTERS_BY_NAME)} (default: all that can be written "
+        f"but {', '.join(ON_REQUEST)}, which takes seconds)",
     )
     parser.add_argument("--html", action="store_true", help="also write a page to look at and move it in a browser")
     parser.add_argument(
@@ -93,9 +99,9 @@ def run(arguments: list[str]) -> int:
         parser.error("--view chooses among the weights of the package: give it with --category, or leave it out")
     out = args.out or Path(f"{args.cloud.stem}-prediction")
     try:
-        candidates, limited = _predict(args)
+        candidates, chosen = _predict(args)
         files = _write(candidates[0], out, args)
-        _print_summary(candidates, files, limited)
+        _print_summary(candidates, files, chosen)
         if args.check:
             _print_check(out, args.metres_per_unit)
     except (PointCloudError, CheckpointError, ExportError, PhysicsCheckError, OSError) as error:
@@ -104,8 +110,8 @@ def run(arguments: list[str]) -> int:
     return 0
 
 
-def _predict(args: argparse.Namespace) -> tuple[list[ScanPrediction], bool]:
-    """What every set of weights that is asked says, best first; whether the best knows upright cameras only."""
+def _predict(args: argparse.Namespace) -> tuple[list[ScanPrediction], ArticulatedPoseEstimator]:
+    """What every set of weights that is asked says, best first, and the best one's estimator."""
     # Imported here: the network takes long to import, and --help needs none of it.
     from articulate_ssl.pretrained.estimator import load
     from articulate_ssl.pretrained.ranking import ranked
@@ -116,12 +122,8 @@ def _predict(args: argparse.Namespace) -> tuple[list[ScanPrediction], bool]:
     progress = track(
         estimator.estimators, "trying weights", console=Console(stderr=True), disable=not several, transient=True
     )
-    limited, found = {}, []
-    for one in progress:
-        found.append(one.predict(cloud, args.refine))
-        limited[one.weights] = one.module.orientation.limited
-    candidates = ranked(found)
-    return candidates, limited[candidates[0].checkpoint]
+    candidates = ranked([one.predict(cloud, args.refine) for one in progress])
+    return candidates, next(one for one in estimator.estimators if one.weights == candidates[0].checkpoint)
 
 
 def _write(result: ScanPrediction, out: Path, args: argparse.Namespace) -> list[Path]:
@@ -139,7 +141,7 @@ def _print_check(out: Path, metres_per_unit: float | None) -> None:
     print(*physics_check.check(out, metres_per_unit).lines(), sep="\n")
 
 
-def _print_summary(candidates: list[ScanPrediction], files: list[Path], limited: bool) -> None:
+def _print_summary(candidates: list[ScanPrediction], files: list[Path], chosen: ArticulatedPoseEstimator) -> None:
     best = candidates[0]
     summary = best.to_dict()
     console = Console()
@@ -147,7 +149,7 @@ def _print_summary(candidates: list[ScanPrediction], files: list[Path], limited:
         _print_choice(candidates, console)
     for table in (_parts_table(summary), _joints_table(summary)):
         console.print(table)
-    if limited:
+    if chosen.module.orientation.limited:
         print("trained on views of an upright camera: the scan is taken to have its axes (x right, y down, z forward)")
     if best.probability is not None:
         print(f"probability that orientation and parts are right: {best.probability:.0%}")
@@ -155,8 +157,20 @@ def _print_summary(candidates: list[ScanPrediction], files: list[Path], limited:
         console.print(f"[bold red]warning:[/] this scan is {best.warning}")
     elif best.unlike is not None and len(candidates) == 1:
         print(f"{best.unlike:.0%} of the training clouds are explained better than this scan")
+    if chosen.card is not None:
+        _print_weakness(chosen.card, console)
     print(f"reconstruction error {summary['reconstruction_error']:.4g} (in the unit of the scan)")
     print("wrote", *files, sep="\n  ")
+
+
+def _print_weakness(card: WeightsCard, console: Console) -> None:
+    """That weights are bad at their category is said with every prediction, not in their card only."""
+    wrong = card.metrics["above_30_rate"]["mean"]
+    if wrong > OFTEN_WRONG:
+        console.print(
+            f"[bold red]warning:[/] these weights turn a part by more than 30 degrees in {wrong:.0%} of their test "
+            f"clouds: articulate-ssl weights show {card.category}-{card.view}"
+        )
 
 
 def _print_choice(candidates: list[ScanPrediction], console: Console) -> None:

@@ -15,7 +15,7 @@ from articulate_ssl.training.shipped_weights import WEIGHTS_FOLDER, shipped_as, 
 from articulate_ssl.training.weights_card import CARD_SUFFIX, HEADLINES, VIEWS, WeightsCard
 
 # Of `HEADLINES`, as short as a table of all weights needs them.
-_HEADINGS = ("R/°", "flips", "T", "axis/°", "pivot", "state", "mIoU")
+_HEADINGS = ("R/°", ">30°", "flips", "T", "axis/°", "pivot", "state", "mIoU")
 _NOT_REPRODUCED = 1  # the exit code
 _BUILD = Path("build/weights")
 _CHECKS = Path("build/weights-check")

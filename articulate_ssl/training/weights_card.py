@@ -19,7 +19,10 @@ VIEWS = {
 }
 LICENCE = "apache-2.0"
 # What people read first, and what weights are compared by (`pretrained.check`).
-HEADLINES = ("r_err_deg", "flip_rate", "t_err", "axis_err_deg", "pivot_err", "state_err", "seg_miou")
+HEADLINES = (
+    *("r_err_deg", "above_30_rate", "flip_rate", "t_err"),
+    *("axis_err_deg", "pivot_err", "state_err", "seg_miou"),
+)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,17 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
-from articulate_ssl.inference.export import arrays, coloured_clouds, glb, mjcf, picture, prediction_json, urdf, usd
+from articulate_ssl.inference.export import (
+    animation,
+    arrays,
+    coloured_clouds,
+    glb,
+    mjcf,
+    picture,
+    prediction_json,
+    urdf,
+    usd,
+)
 from articulate_ssl.inference.export.rigid_links import MESH_FOLDER
 from articulate_ssl.inference.scan_prediction import ScanPrediction
 
@@ -21,9 +31,12 @@ EXPORTERS_BY_NAME: dict[str, Exporter] = {
     "glb": glb.write,
     "usd": usd.write,
     "picture": picture.write,
+    "gif": animation.write,
     "arrays": arrays.write,
     "json": prediction_json.write,
 }
+# Written only where asked for by name, because they take seconds.
+ON_REQUEST = ("gif",)
 
 
 class Extra(NamedTuple):
@@ -46,13 +59,15 @@ class ExportError(ValueError):
 
 
 def exporters_named(names: Sequence[str] | None = None) -> tuple[Exporter, ...]:
-    """The exporters of these formats, in the order of `EXPORTERS_BY_NAME`; of None, all that this machine can write.
+    """The exporters of these formats, in the order of `EXPORTERS_BY_NAME`.
+
+    Of None, all that this machine can write but those `ON_REQUEST`.
 
     Raises:
         ExportError: if a name is unknown, or if its format needs a package that is not installed.
     """
     if names is None:
-        return tuple(write for name, write in EXPORTERS_BY_NAME.items() if _installed(name))
+        return tuple(write for name, write in EXPORTERS_BY_NAME.items() if name not in ON_REQUEST and _installed(name))
     unknown = [name for name in names if name not in EXPORTERS_BY_NAME]
     if unknown:
         raise ExportError(f"no export is called {', '.join(unknown)}; there are {', '.join(EXPORTERS_BY_NAME)}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +30,9 @@ from datamodules.atomic import atomic_write
 PANEL_INCHES = 2.6
 INK = "#222222"
 LIGHT = np.array([-0.36, 0.6, 0.71])
+# Share of their colour that points keep which a moving object leaves behind; chosen by looking at pictures.
+FAINT = 0.3
+MARGIN = 0.02  # of a moving picture, as a share of its size: discs and arrowheads reach beyond their points
 
 
 @dataclass(frozen=True)
@@ -133,6 +136,47 @@ def samples_figure(rows: Sequence[SampleRow]) -> Figure:
     return figure
 
 
+def moving_figures(
+    prediction: Prediction,  # B = 1
+    points: np.ndarray,  # [N, 3]
+    part_id: np.ndarray,  # [N]
+    state_range: Tensor,  # [J, 2] as of `prediction_figure`
+    states: Tensor,  # [F, J]
+    size: tuple[float, float],  # inches: width, height
+    upright: bool = False,
+) -> Iterator[Figure]:
+    """The object and its joints in one set of states after the other, and the scan faintly behind where it was.
+
+    All F figures are of the same size, and share one scale and the view of `prediction_figure`.
+    """
+    prediction = prediction.to("cpu")
+    view = viewing_rotation(prediction, state_range.to(prediction.joint_state), upright)
+    cloud = _seen(prediction, torch.as_tensor(points), view)
+    surfaces = _surfaces(prediction, cloud)
+    poses = [_seen_pose(part_motion(prediction, one)[0], view) for one in states]
+    drawings = [lit_triangles(surfaces, pose) for pose in poses]
+    arrows = [_seen_arrows(prediction, pose) for pose in poses]
+    shapes = [cloud, *(arrow for of_one in arrows for arrow in of_one)]
+    window = _window(shapes + [drawing.corners.reshape(-1, 2) for drawing in drawings])
+    for drawing, of_one in zip(drawings, arrows, strict=True):
+        figure = Figure(figsize=size)
+        ax = figure.add_axes((MARGIN, MARGIN, 1 - 2 * MARGIN, 1 - 2 * MARGIN))
+        _draw_cloud(ax, cloud, part_id, window, FAINT)
+        _draw_surfaces(ax, drawing, window)
+        for arrow in of_one:
+            _draw_arrow(ax, arrow)
+        yield figure
+
+
+def _seen_arrows(
+    prediction: Prediction,
+    poses: np.ndarray,  # [K, 4, 4] canonical object space -> right, up, towards the viewer
+) -> list[np.ndarray]:  # [J] of [3, 3] tail, middle, tip
+    """Those of the joints, each on the part that it is fixed to."""
+    parents = prediction.joint_parent[0].tolist()
+    return [joint_arrow(prediction, j) @ poses[k, :3, :3].T + poses[k, :3, 3] for j, k in enumerate(parents)]
+
+
 def _predicted_motion(prediction: Prediction) -> Tensor:  # [K, 4, 4] float64
     """Motion of every part in canonical object space as its pose has it, whether or not it obeys the joints."""
     apart = torch.eye(4, dtype=torch.float64).repeat(prediction.num_parts, 1, 1)
@@ -179,8 +223,9 @@ def _draw_cloud(
     shape: np.ndarray,  # [N, 3] right, up, towards the viewer
     part_id: np.ndarray,  # [N], -1 is grey
     window: tuple[np.ndarray, np.ndarray],
+    strength: float = 1.0,
 ) -> None:
-    """Points as lit discs that just close up, far ones first and paler."""
+    """Points as lit discs that just close up, far ones first and paler; of a `strength` below one all are paler."""
     brightness, spacing = np.ones(len(shape)), np.zeros(len(shape))
     for part in np.unique(part_id):
         of_part = part_id == part
@@ -190,9 +235,9 @@ def _draw_cloud(
     colour = 1 - (0.7 + 0.3 * depth[:, None]) * (1 - colour)
     diameter = np.clip(2.0 * spacing * PANEL_INCHES * 72 / (2 * window[1][0]), 1.2, 9.0)
     order = np.argsort(shape[:, 2])
-    ax.scatter(
-        *shape[order, :2].T, s=diameter[order] ** 2, c=colour[order], linewidths=0.2, edgecolors=0.7 * colour[order]
-    )
+    colour = colour[order]
+    inside, edge = 1 - strength * (1 - colour), 1 - strength * (1 - 0.7 * colour)
+    ax.scatter(*shape[order, :2].T, s=diameter[order] ** 2, c=inside, linewidths=0.2, edgecolors=edge)
     _show_window(ax, window)
 
 

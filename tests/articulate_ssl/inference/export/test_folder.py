@@ -7,6 +7,7 @@ from articulate_ssl.inference.export import picture, prediction_json, rigid_link
 from articulate_ssl.inference.export.folder import (
     EXPORTERS,
     EXPORTERS_BY_NAME,
+    ON_REQUEST,
     ExportError,
     exporters_named,
     write_prediction,
@@ -72,8 +73,15 @@ def test_a_failure_half_way_leaves_the_earlier_results(tmp_path, monkeypatch):
 def test_exporters_are_found_by_name_and_the_json_stays_last():
     found = exporters_named(["json", "glb", "urdf", "glb"])
     assert found == tuple(EXPORTERS_BY_NAME[name] for name in ("urdf", "glb", "json"))
-    assert exporters_named(None) == EXPORTERS == tuple(EXPORTERS_BY_NAME.values())
+    usual = [name for name in EXPORTERS_BY_NAME if name not in ON_REQUEST]
+    assert exporters_named(None) == EXPORTERS == exporters_named(usual)
     assert exporters_named([]) == ()
+
+
+def test_the_moving_picture_is_written_only_where_it_is_asked_for():
+    gif = EXPORTERS_BY_NAME["gif"]
+    assert gif not in exporters_named(None)
+    assert exporters_named(["gif"]) == (gif,)
 
 
 def test_a_format_without_mesh_files_leaves_no_empty_folder(tmp_path):
@@ -89,6 +97,6 @@ def test_an_unknown_name_is_refused_with_the_known_ones():
 def test_a_format_whose_package_is_missing_is_left_out_and_refused_where_asked_for(monkeypatch):
     monkeypatch.setattr(export_folder, "find_spec", lambda package: None)
     assert EXPORTERS_BY_NAME["usd"] not in exporters_named(None)
-    assert len(exporters_named(None)) == len(EXPORTERS_BY_NAME) - 1
+    assert len(exporters_named(None)) == len(EXPORTERS) - 1
     with pytest.raises(ExportError, match=r"usd needs .*pxr.* pip install 'articulate-ssl\[usd\]'"):
         exporters_named(["json", "usd"])
