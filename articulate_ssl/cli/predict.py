@@ -165,8 +165,8 @@ def _print_summary(candidates: list[ScanPrediction], files: list[Path], chosen: 
 
 def _print_weakness(card: WeightsCard, console: Console) -> None:
     """That weights are bad at their category is said with every prediction, not in their card only."""
-    wrong = card.metrics["above_30_rate"]["mean"]
-    if wrong > OFTEN_WRONG:
+    wrong = card.metrics.get("above_30_rate", {}).get("mean")  # no card has to know it
+    if wrong is not None and wrong > OFTEN_WRONG:
         console.print(
             f"[bold red]warning:[/] these weights turn a part by more than 30 degrees in {wrong:.0%} of their test "
             f"clouds: articulate-ssl weights show {card.category}-{card.view}"

@@ -22,6 +22,7 @@ from articulate_ssl.inference.point_cloud_io import normalise_cloud
 from articulate_ssl.inference.prediction import Prediction, ScanEstimate
 from articulate_ssl.inference.scan_prediction import ScanPrediction, in_scan_frame
 from articulate_ssl.ops.chamfer import chamfer
+from articulate_ssl.ops.denormals import flush_denormals
 from datamodules.atomic import atomic_write
 
 CATEGORY = "twin"  # what predictions and exports call an object that is its own category
@@ -101,7 +102,8 @@ def find_twin(
     count = min([_POINTS, *map(len, clouds)])
     read = [normalise_cloud(cloud, count, scale=scale) for cloud in clouds]
     points = torch.from_numpy(np.stack([one for one, _, _ in read])) if read else torch.zeros(0, count, 3)
-    found = find_one_object(points, num_parts, _JOINT_TYPES[joint], seed=seed)
+    with flush_denormals():
+        found = find_one_object(points, num_parts, _JOINT_TYPES[joint], seed=seed)
     scans = tuple(_scan(found, i, points[i], cloud, read[i][1], scale) for i, cloud in enumerate(clouds))
     return Twin(scans, float(found.misfit.median()), found.unexplained)
 

@@ -23,6 +23,7 @@ from articulate_ssl.discovery.one_object.moving_labels import CAP, moving_costs,
 from articulate_ssl.discovery.one_object.surface import Surface
 from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.geometry.kinematic_chain import KinematicChain
+from articulate_ssl.geometry.screw import PRISMATIC
 from articulate_ssl.ops.farthest_point import farthest_point_order
 from articulate_ssl.ops.progress import Stage, announce
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
@@ -123,12 +124,12 @@ def _attempt(
         _announce(_COARSE_STAGES + step, f"round {step + 1} of {_ROUNDS}")
         thin = [surface.thinned(_POINTS) for surface in surfaces]
         _, probability = _labelled(surfaces, placed, _POINTS)
-        placed = adjusted(placed, thin, _kept_parts(probability))
+        label = _kept_parts(probability)
+        # Bodies have more surface than what moves on them.
+        placed = adjusted(rooted_at(placed, int(np.bincount(label.ravel()).argmax())), thin, label)
     _announce(_COARSE_STAGES + _ROUNDS, "fusing")
     cost, probability = _labelled(surfaces, placed, _LABELLED)
     label = _kept_parts(probability)
-    if num_parts == 2:
-        placed = _rooted_at(placed, int(np.bincount(label.ravel()).argmax()))
     return _fused(placed, surfaces, label, probability, cost, part_points)
 
 
@@ -159,14 +160,27 @@ def _kept_parts(probability: np.ndarray) -> np.ndarray:
     return label
 
 
-def _rooted_at(placed: Placed, root: int) -> Placed:
-    """Of two parts, take one for the base: the same joint, seen from the other side."""
-    joints = placed.joints
-    if joints.chain.root == root:
+def rooted_at(placed: Placed, root: int) -> Placed:
+    """Take another part for the base, where that changes no motion: of two parts, or of parts that slide one way.
+
+    What slides slides against any other part: the one that moved least in the clouds need not be the body.
+    """
+    joints, chain = placed.joints, placed.joints.chain
+    sliding = joints.joint_type == PRISMATIC and set(chain.parent) == {chain.root}
+    if chain.root == root or not (sliding or chain.num_parts == 2):
         return placed
-    base = placed.pose[:, root]
-    chain = KinematicChain(2, root, (root,), (1 - root,))
-    return Placed(replace(joints, chain=chain), base, -placed.state)
+    children = tuple(part for part in range(chain.num_parts) if part != root)
+    star = KinematicChain(chain.num_parts, root, (root,) * len(children), children)
+    if not sliding:
+        return Placed(replace(joints, chain=star), placed.pose[:, root], -placed.state)
+    sign = (joints.axis @ joints.axis[0]).sign()
+    axis = torch.nn.functional.normalize((sign[:, None] * joints.axis).mean(dim=0), dim=-1)
+    height = torch.zeros(len(placed.base), chain.num_parts).to(placed.state)
+    height[:, list(chain.child)] = sign * placed.state
+    pivot = torch.zeros(chain.num_parts, 3).to(joints.pivot)
+    pivot[list(chain.child)] = joints.pivot
+    lines = replace(joints, chain=star, axis=axis.expand(len(children), 3).clone(), pivot=pivot[list(children)])
+    return Placed(lines, placed.pose[:, root], height[:, list(children)] - height[:, [root]])
 
 
 def _fused(

@@ -9,7 +9,12 @@ from twin_objects import with_little_effort
 
 from articulate_ssl.discovery.discover import DiscoveryError
 from articulate_ssl.discovery.one_object import find
-from articulate_ssl.discovery.one_object.find import MIN_CLOUDS, find_one_object
+from articulate_ssl.discovery.one_object.adjustment import Placed
+from articulate_ssl.discovery.one_object.find import MIN_CLOUDS, find_one_object, rooted_at
+from articulate_ssl.geometry.kinematic_chain import KinematicChain
+from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE
+from articulate_ssl.geometry.se3 import se3
+from articulate_ssl.shape.joints import Joints
 
 
 @pytest.fixture(autouse=True)
@@ -52,3 +57,21 @@ def test_an_object_that_does_not_move_is_refused():
     still = data.points[:1].repeat(8, 1, 1)
     with pytest.raises(DiscoveryError, match="parts"):
         find_one_object(still, 2, OVEN[4])
+
+
+@pytest.mark.parametrize(("num_parts", "joint_type"), [(2, REVOLUTE), (2, PRISMATIC), (4, PRISMATIC)])
+@pytest.mark.parametrize("root", [0, 1])
+def test_another_base_moves_no_part_otherwise(num_parts, joint_type, root):
+    generator = torch.Generator().manual_seed(0)
+    chain = KinematicChain(num_parts, 0, (0,) * (num_parts - 1), tuple(range(1, num_parts)))
+    axis = torch.tensor([[0.6, 0.0, 0.8]], dtype=torch.float64).repeat(num_parts - 1, 1)
+    axis[-1] *= -1  # a joint that is described the other way round
+    pivot = torch.randn(num_parts - 1, 3, generator=generator, dtype=torch.float64)
+    state = torch.randn(5, num_parts - 1, generator=generator, dtype=torch.float64)
+    base = se3(torch.eye(3).expand(5, 3, 3), torch.randn(5, 3, generator=generator)).double()
+    placed = Placed(Joints(chain, axis, pivot, joint_type), base, state)
+    moved = rooted_at(placed, root)
+    assert moved.joints.chain.root == root
+    # At rest parts may stand elsewhere; from any state to any other they move alike.
+    before, after = (p.pose[1:] @ torch.linalg.inv(p.pose[:1]) for p in (placed, moved))
+    torch.testing.assert_close(after, before)
