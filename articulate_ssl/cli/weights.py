@@ -15,7 +15,7 @@ from articulate_ssl.training.shipped_weights import WEIGHTS_FOLDER, shipped_as, 
 from articulate_ssl.training.weights_card import CARD_SUFFIX, HEADLINES, VIEWS, WeightsCard
 
 # Of `HEADLINES`, as short as a table of all weights needs them.
-_HEADINGS = ("R/°", ">30°", "flips", "T", "axis/°", "pivot", "state", "mIoU")
+_HEADINGS = ("R", ">30°", "flips", "T", "axis", "pivot", "state", "mIoU")
 _NOT_REPRODUCED = 1  # the exit code
 _BUILD = Path("build/weights")
 _CHECKS = Path("build/weights-check")
@@ -71,14 +71,20 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _list(_args: argparse.Namespace) -> int:
-    table = Table(Column("weights", no_wrap=True), "MB", *_HEADINGS, title="means over test clouds")
+    headings = (Column(heading, no_wrap=True) for heading in ("weights", "MB", *_HEADINGS))
+    # 80 columns hold no lines between them.
+    table = Table(*headings, title="means over test clouds", box=None, pad_edge=False)
     for weights in shipped_weights():
         card = WeightsCard.load(weights.file.with_suffix(CARD_SUFFIX))
         means = (card.metrics[name]["mean"] for name in HEADLINES)
-        cells = ("-" if mean is None else f"{mean:.2g}" for mean in means)
-        table.add_row(weights.name, f"{weights.file.stat().st_size / 1e6:.2f}", *cells)
+        cells = ("-" if mean is None else _short(mean) for mean in means)
+        table.add_row(weights.name, f"{weights.file.stat().st_size / 1e6:.1f}", *cells)
     Console().print(table)
     return 0
+
+
+def _short(value: float) -> str:
+    return f"{value:.1f}" if abs(value) >= 1 else f"{value:.2f}".lstrip("0")
 
 
 def _show(args: argparse.Namespace) -> int:

@@ -46,7 +46,7 @@ def test_a_run_that_was_not_tested_exits_2(package, tmp_path, capsys, run_folder
     assert "run `lightning test` first" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("scale", "code", "words"), [(1.0, 0, "7 of 7 numbers"), (4.0, 1, "the cards do not hold")])
+@pytest.mark.parametrize(("scale", "code", "words"), [(1.0, 0, "8 of 8 numbers"), (4.0, 1, "the cards do not hold")])
 def test_a_check_says_whether_the_cards_hold(package, monkeypatch, capsys, scale, code, words):
     def measured(weights, seed, build, say):
         return check.compare(weights.name, made_up_metrics(), made_up_metrics(scale=scale))
