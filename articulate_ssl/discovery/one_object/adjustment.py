@@ -20,7 +20,7 @@ from articulate_ssl.shape.joints import Joints
 
 _PARTNERS = 4  # clouds that each cloud is matched with, others in every matching
 _NEIGHBOURS = 4  # candidates among which one with a like normal is looked for
-_ALIKE = 0.8  # least cosine between normals
+_ALIKE = 0.8  # least cosine between normals; chosen, not tuned
 _ITERATIONS = 12  # of L-BFGS between two matchings
 _FARTHEST = (
     0.1,

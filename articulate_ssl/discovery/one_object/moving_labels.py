@@ -15,8 +15,8 @@ from articulate_ssl.discovery.one_object.surface import Surface
 
 CAP = 0.02  # normalised units: a point farther than this from the surface is not on it
 _NEIGHBOURS = 12  # of a point, between which the walk goes
-# Normalised units. A step along a normal of this length ends the walk. From .003 to .006 chests of known poses gained .02
-# of IoU, and laptops lost .015.
+# Normalised units. A step along a normal of this length ends the walk. From .003 to .006 chests of known poses gained
+# .02 of IoU, and laptops lost .015.
 _STEP = 0.004
 _PARALLEL = 16  # power of the cosine between normals that a step is weighted by
 _LOOSE = 1e-4  # weight of a step between faces, which keeps lone points solvable
