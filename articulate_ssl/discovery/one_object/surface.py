@@ -17,8 +17,8 @@ from articulate_ssl.ops.kd_tree import kd_tree
 _NORMAL_NEIGHBOURS = 12
 _NEIGHBOURS = 6  # surface samples that a query is compared with
 _ALIKE = 0.8  # least cosine between the normals of a query and a sample on the same face
-# Tangential distance to the nearest sample, in spacings, beyond which a query lies past the edge of the face. Chosen, as
-# are the other numbers here.
+# Tangential distance to the nearest sample, in spacings, beyond which a query lies past the edge of the face. Chosen,
+# as are the other numbers here.
 _BEYOND = 2.0
 
 
