@@ -22,16 +22,8 @@ _PARTNERS = 4  # clouds that each cloud is matched with, others in every matchin
 _NEIGHBOURS = 4  # candidates among which one with a like normal is looked for
 _ALIKE = 0.8  # least cosine between normals; chosen, not tuned
 _ITERATIONS = 12  # of L-BFGS between two matchings
-_FARTHEST = (
-    0.1,
-    0.06,
-    0.06,
-    0.03,
-    0.03,
-    0.015,
-    0.015,
-    0.015,
-)  # normalised units: matches beyond are none, matching by matching
+# Normalised units: matches beyond are none, matching by matching.
+_FARTHEST = (0.1, 0.06, 0.06, 0.03, 0.03, 0.015, 0.015, 0.015)
 _SOFTER = 5.0  # residuals beyond that part of the farthest match count linearly
 
 

@@ -38,7 +38,7 @@ def moving_costs(
         for part in range(pose.shape[1]):
             for j, other in enumerate(surfaces):
                 if j != i:
-                    cost[i, :, part] += other.nearest(own.moved(pose[j, part] @ back[i, part]), CAP)[0]
+                    cost[i, :, part] += other.nearest(own.moved(pose[j, part] @ back[i, part]), CAP)
     return cost / (len(surfaces) - 1)
 
 

@@ -55,20 +55,20 @@ class Surface:
         """The first `count` samples, an even selection where points are in farthest-point order."""
         return Surface(self.points[:count], self.normals[:count])
 
-    def moved(self, pose: np.ndarray) -> Surface:
-        """Under a pose [4, 4], or a pose of every point [N, 4, 4]."""
-        rotation = pose[..., :3, :3]
-        return Surface(
-            np.einsum("...ij,nj->ni" if pose.ndim == 2 else "nij,nj->ni", rotation, self.points) + pose[..., :3, 3],
-            np.einsum("...ij,nj->ni" if pose.ndim == 2 else "nij,nj->ni", rotation, self.normals),
-        )
+    def moved(
+        self,
+        pose: np.ndarray,  # [4, 4]
+    ) -> Surface:
+        """Under a pose."""
+        turn = pose[:3, :3].T
+        return Surface(self.points @ turn + pose[:3, 3], self.normals @ turn)
 
     def nearest(
         self,
         query: Surface,  # Q samples
         cap: float,
-    ) -> tuple[np.ndarray, np.ndarray]:  # [Q], [Q]
-        """Distance of oriented points to this surface, at most `cap`, and the sample it was measured to.
+    ) -> np.ndarray:  # [Q]
+        """Distance of oriented points to this surface, at most `cap`.
 
         Along the sample's normal, and past the edge of the face also along the face.
         """
@@ -77,6 +77,4 @@ class Surface:
         past = np.sqrt(np.maximum(distance**2 - along**2, 0)) - _BEYOND * self.spacing
         alike = np.abs(np.einsum("qki,qi->qk", self.normals[index], query.normals)) > _ALIKE
         error = np.where(alike, np.hypot(along, np.maximum(past, 0)), cap)
-        best = error.argmin(axis=1)
-        rows = np.arange(len(best))
-        return np.minimum(error[rows, best], cap), index[rows, best]
+        return np.minimum(error.min(axis=1), cap)
