@@ -14,7 +14,7 @@ from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.metrics.label_free import LabelFreeMetrics
 from articulate_ssl.metrics.report import write_report
 from articulate_ssl.training.self_agreement import another_look
-from articulate_ssl.training.test_report import PICTURE_NAME, concatenate
+from articulate_ssl.training.test_report import PICTURE_NAME, concatenate, typical
 from datamodules.manifest import Manifest
 
 
@@ -87,10 +87,8 @@ class LabelFreeReport:
         prediction = concatenate([p for *_, p in self._clouds])
         scans = manifest.scans["test"]
         copies = manifest.num_samples("test") // len(scans)
-        order = error.argsort()
         rows = []
-        for name, index in (("best", order[0]), ("median", order[len(order) // 2]), ("worst", order[-1])):
-            i = int(index)
+        for name, i in typical(error).items():
             title = f"{name}: relative error {error[i]:.3f}, {scans[int(sample[i]) // copies]}"
             one = prediction[i : i + 1]
             rows.append(SampleRow(title, points[i].numpy(), one, upright=self._limited))

@@ -24,6 +24,12 @@ def concatenate(predictions: list[Prediction]) -> Prediction:
     return Prediction(**{f.name: torch.cat([getattr(p, f.name) for p in predictions]) for f in fields(Prediction)})
 
 
+def typical(error: Tensor) -> dict[str, int]:
+    """Which of the clouds [S] are the best, the median and the worst, by their errors."""
+    order = error.argsort().tolist()
+    return {"best": order[0], "median": order[len(order) // 2], "worst": order[-1]}
+
+
 class TestReport:
     """Scores batches of test clouds against a calibration measured on training clouds.
 
@@ -97,10 +103,8 @@ class TestReport:
         points = torch.cat([p for p, *_ in self.samples])
         truth = self.calibration.slot_of_part.cpu()[torch.cat([t for _, t, _ in self.samples])]
         prediction = concatenate([p for *_, p in self.samples])
-        order = error.argsort()
         rows = []
-        for name, index in (("best", order[0]), ("median", order[len(order) // 2]), ("worst", order[-1])):
-            i = int(index)
+        for name, i in typical(error).items():
             title = f"{name}: mean R error {error[i]:.1f}°"
             rows.append(SampleRow(title, points[i].numpy(), prediction[i : i + 1], truth[i].numpy(), self.upright))
         draw_test_samples(rows, path)
