@@ -5,6 +5,8 @@
    cloud in the part frames of the last winner (paper, Sec. 3.1).
 3. *Registration* at test time: the leading hypotheses' predicted shapes are registered to the cloud without leaving
    their joints, and the best reconstruction wins.
+4. *Decision*, where a category's clouds can be explained in two ways that fit alike: the winner's twin is registered,
+   too, and the relief of all points decides (`two_ways`).
 
 Training takes the first two steps too; nothing here knows a loss or an optimiser.
 """
@@ -12,7 +14,7 @@ Training takes the first two steps too; nothing here knows a loss or an optimise
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,20 +24,31 @@ import torch
 from torch import Tensor
 
 from articulate_ssl.discovery.registration import register_articulated
+from articulate_ssl.discovery.search import search_articulated
+from articulate_ssl.geometry.rotation_group import rotation_group
+from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
 from articulate_ssl.inference.confidence import relative_error
 from articulate_ssl.inference.point_cloud_io import normalise_cloud
 from articulate_ssl.inference.prediction import Prediction, ScanEstimate
+from articulate_ssl.inference.relief import NUM_FEATURES, describe_relief
+from articulate_ssl.inference.two_ways import TwoWays
 from articulate_ssl.losses.reconstruction import distances_to_parts
 from articulate_ssl.network.articulated_network import ArticulatedNetwork
 from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.network.rigid_alignment import RigidAlignment
-from articulate_ssl.ops.chamfer import chamfer, hypothesis_distances
+from articulate_ssl.ops.chamfer import chamfer, hypothesis_distances, nearest_distance
+from articulate_ssl.ops.kd_tree import kd_tree
 from articulate_ssl.shape.observation import Observation
+from articulate_ssl.shape.stretch import principal_directions
 
 _ANOTHER_WAY = math.radians(30)  # beyond, one of two hypotheses is wrong (`metrics.above_30_rate`)
 # Standard deviations, over the training clouds, by which the scale of a scan may differ from their mean.
 _SCALE_STARTS = (-1.5, -0.75, 0.0, 0.75, 1.5)
+_SIDE = 1 / 3  # of the width of a joint's range, from its middle, where a search without a network starts, too
+_AGREEING_POINTS = 64  # of a cloud, farthest-point order: which way round its parts are shows in few
+_RELIEF_POINTS = 4096  # of a scan: as many as a generated cloud has
+_SCANS_AT_ONCE = 16  # bounds the memory; each is a cloud per start
 
 
 @dataclass(frozen=True)
@@ -43,21 +56,25 @@ class InferenceOptions:
     """What happens at test time after the network.
 
     Attributes:
-        refine: Register the predicted shape to the cloud from the best hypotheses.
+        refine: Register the predicted shape to the cloud from the best hypotheses; null leaves it to the recipe (true
+            staged, false paper).
         points: Most points of a cloud that registration reads and labels (a farthest-point prefix). Which way up a
             closed laptop is shows in less than the spacing of the few points that suffice for the networks.
         candidates: Hypotheses that are refined; the best reconstruction wins.
         rounds: Rounds of registration.
         coarse_scale: First standard deviation of the correspondences, in normalised units.
         fine_scale: Last one.
+        columns: Report at test time, from the same clouds, what the category's shape without a network reaches, the
+            network alone, and the network with registration (`training/columns.py`).
     """
 
-    refine: bool = True
+    refine: bool | None = None
     points: int = 512
     candidates: int = 4
     rounds: int = 8
     coarse_scale: float = 0.05
     fine_scale: float = 0.02
+    columns: bool = False
 
 
 def rivals(
@@ -77,6 +94,20 @@ def rivals(
     return torch.where(least.isinf(), chosen, rival), (1 - error[rows, chosen] / least).clamp(0, 1)
 
 
+@torch.no_grad()
+def part_distances(
+    points: Tensor,  # [B, C, 3]
+    posed: Tensor,  # [B, H, K, M, 3]
+    association: Tensor,  # [B, C, K], rows sum to one
+) -> Tensor:  # [B, H]
+    """Mean distance of points to the parts that they belong to, of every hypothesis, for choosing among them."""
+    result = 0.0
+    for part, weight in zip(posed.unbind(2), association.unbind(-1), strict=True):
+        query = points[:, None].expand(-1, part.shape[1], -1, -1)
+        result = result + (nearest_distance(query, part) * weight[:, None]).mean(dim=-1)
+    return result
+
+
 @dataclass(frozen=True)
 class Iteration:
     """One pose estimation of clouds.
@@ -86,19 +117,34 @@ class Iteration:
         hypotheses: One per group element.
         start: The estimate that the hypotheses are residuals to (the winner of the iteration before), or None.
         observation: How hypotheses are compared; those that are turned too far are the last to be chosen.
+        agreement: Weight, beside d(X, Y^g), of the distance to the parts that the slot attention assigns.
+        compared: So many points of a cloud, and as many of a hypothesis, are compared; None compares all.
     """
 
     points: Tensor
     hypotheses: Hypotheses
     start: Hypotheses | None
     observation: Observation
+    agreement: float = 0.0
+    compared: int | None = None
 
     @cached_property
     @torch.no_grad()
     def distance(self) -> Tensor:
-        """d(X, Y^g) of every hypothesis, [B, G], without gradient."""
-        posed = self.hypotheses.posed().flatten(2, 3)
-        return hypothesis_distances(self.points, posed, bidirectional=self.observation.bidirectional)
+        """d(X, Y^g) of every hypothesis, and that of its parts to theirs if that counts, [B, H], without gradient."""
+        posed = self.hypotheses.posed(self._every)
+        points = self.points[:, : self.compared]
+        whole = hypothesis_distances(points, posed.flatten(2, 3), bidirectional=self.observation.bidirectional)
+        if self.agreement == 0:
+            return whole
+        logits = self.hypotheses.association_logits[:, :_AGREEING_POINTS]
+        return whole + self.agreement * part_distances(self.points[:, : logits.shape[1]], posed, logits.softmax(dim=-1))
+
+    @property
+    def _every(self) -> int:
+        """Of the points of a part one in so many is compared."""
+        parts, shape_points = self.hypotheses.part_shape.shape[1:3]
+        return 1 if self.compared is None else max(1, parts * shape_points // self.compared)
 
     @property
     def winner(self) -> Tensor:
@@ -107,8 +153,12 @@ class Iteration:
 
     def leading(self, count: int) -> Tensor:
         """The hypotheses of the smallest d(X, Y^g), best first, [B, count]."""
-        ranked = self.observation.ranked(self.distance, self.hypotheses.base[..., :3, :3])
-        return ranked.topk(count, largest=False).indices
+        return self.ranked.topk(count, largest=False).indices
+
+    @cached_property
+    def ranked(self) -> Tensor:
+        """`distance`, larger than all others where a hypothesis is turned too far, [B, H]."""
+        return self.observation.ranked(self.distance, self.hypotheses.base[..., :3, :3])
 
 
 class PoseEstimator:
@@ -121,7 +171,14 @@ class PoseEstimator:
         observation: How clouds are taken.
         posterior_scale: Standard deviation of the association of points with posed parts, in normalised units.
         inference: Registration at test time.
+
+    Attributes:
+        agreement, compared: See `Iteration`; recipes may set them.
+        two_ways: The decision between explanations that fit alike, if one was learnt; a module owns it.
     """
+
+    agreement: float = 0.0
+    compared: int | None = None
 
     def __init__(
         self,
@@ -134,6 +191,7 @@ class PoseEstimator:
     ) -> None:
         self.articulated, self.rigid, self.iterations = articulated, rigid, iterations
         self.observation, self.posterior_scale, self.inference = observation, posterior_scale, inference
+        self.two_ways = TwoWays(articulated.num_parts, articulated.num_parts * NUM_FEATURES)
 
     def align(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Stage 0: clouds turned roughly to canonical orientation [B, N, 3], and the pose [B, 4, 4] that undoes it."""
@@ -155,7 +213,7 @@ class PoseEstimator:
         start, labels = None, None
         for number in range(self.iterations):
             hypotheses = self.articulated(points, start, labels)
-            iteration = Iteration(points, hypotheses, start, self.observation)
+            iteration = Iteration(points, hypotheses, start, self.observation, self.agreement, self.compared)
             yield iteration
             if number + 1 < self.iterations:
                 start = hypotheses.select(iteration.winner)
@@ -188,17 +246,20 @@ class PoseEstimator:
         points: Tensor,  # [B, N, 3] normalised, farthest-point order
         num_points: int,
         refine: bool | None = None,
+        dense: Tensor | None = None,  # [B, P, 3] the same clouds with all their points
     ) -> Prediction:
         """Predictions for whole clouds; one cloud's does not depend on the rest of the batch.
 
         Args:
             num_points: The networks read this many leading points; registration reads all.
             refine: Register at test time, or not; None does what the options say.
+            dense: What a decision between two explanations reads, an even sample of the surface and about as many
+                points as in training; without them, and without registration, none is made.
 
         Raises:
             ValueError: if a cloud has NaN or infinite points.
         """
-        return self.predict_with_rivals(points, num_points, refine)[0]
+        return self.predict_with_rivals(points, num_points, refine, dense)[0]
 
     @torch.no_grad()
     def predict_with_rivals(
@@ -206,6 +267,7 @@ class PoseEstimator:
         points: Tensor,  # [B, N, 3] normalised, farthest-point order
         num_points: int,
         refine: bool | None = None,
+        dense: Tensor | None = None,  # [B, P, 3]
     ) -> tuple[Prediction, Prediction]:
         """`predict`, and of every cloud the best hypothesis that is turned another way (the same, if none is).
 
@@ -215,44 +277,153 @@ class PoseEstimator:
         if not torch.isfinite(points).all():
             raise ValueError("a cloud has NaN or infinite points")
         with torch.autocast(points.device.type, enabled=False):
-            aligned, pose = self.align(points[:, :num_points])
-            *_, last = self.iterate(aligned)
-            if self.inference.refine if refine is None else refine:
-                candidates, error = self._refine(last, transform_points(invert_se3(pose), points))
-            else:
-                candidates, error = last.hypotheses, last.distance
-            candidates = candidates.at(pose[:, None] @ candidates.base, candidates.state)
+            registers = (self.inference.refine if refine is None else refine) is not False
+            candidates, error = self._candidates(points, num_points, registers)
             rotation = candidates.base[..., :3, :3]
             best = self.observation.ranked(error, rotation).argmin(dim=1)
             rival, margin = rivals(error, candidates.base, best, self.observation.orientation.contains(rotation))
-            chosen = self._prediction(candidates.select(best), points, margin)
-            return chosen, self._prediction(candidates.select(rival), points, torch.zeros_like(margin))
+            chosen, other = candidates.select(best), candidates.select(rival)
+            if registers and dense is not None and self.two_ways.learnt:
+                twin = self._twin(chosen, points)
+                odds = self.two_ways.log_odds(self._relief(chosen, dense), self._relief(twin, dense))
+                chosen, other = _exchanged(chosen, twin, odds < 0)
+                margin = (odds.abs() / 2).tanh()  # how much likelier than not
+            return self._prediction(chosen, points, margin), self._prediction(other, points, torch.zeros_like(margin))
 
-    def predict_scan(
+    @torch.no_grad()
+    def reliefs(
         self,
-        points: np.ndarray,  # [N, 3] any unit and origin
+        points: Tensor,  # [B, N, 3] normalised, farthest-point order
+        num_points: int,
+        dense: Tensor,  # [B, P, 3] the same clouds with all their points
+    ) -> tuple[Tensor, Tensor]:  # [B, F], [B, F]
+        """The relief of predictions and of their twins, from which `two_ways` learns to decide."""
+        candidates, error = self._candidates(points, num_points, registers=True)
+        chosen = candidates.select(self.observation.ranked(error, candidates.base[..., :3, :3]).argmin(dim=1))
+        return self._relief(chosen, dense), self._relief(self._twin(chosen, points), dense)
+
+    def _candidates(self, points: Tensor, num_points: int, registers: bool) -> tuple[Hypotheses, Tensor]:
+        """Among which a prediction is chosen, in the frame of the points, and their errors [B, H]."""
+        aligned, pose = self.align(points[:, :num_points])
+        *_, last = self.iterate(aligned)
+        if registers:
+            candidates, error = self._refine(last, transform_points(invert_se3(pose), points))
+        else:
+            candidates, error = last.hypotheses, last.distance
+        return candidates.at(pose[:, None] @ candidates.base, candidates.state), error
+
+    def _twin(
+        self,
+        one: Hypotheses,  # H = 1
+        points: Tensor,  # [B, N, 3]
+    ) -> Hypotheses:
+        """The other explanation of clouds that have two, registered."""
+        pose = self.two_ways.twin_poses(one.object_pose()[:, 0])
+        state = one.articulated_shape().read_states(pose)
+        start = one.at(pose[:, None, one.chain.root], state[:, None])
+        scales = self.inference.coarse_scale, self.inference.fine_scale
+        base, state, _ = self.register(start, points, scales, self.inference.rounds)
+        return one.at(base, state)
+
+    def _relief(
+        self,
+        one: Hypotheses,  # H = 1
+        dense: Tensor,  # [B, P, 3]
+    ) -> Tensor:  # [B, K * NUM_FEATURES]
+        """The relief of clouds under an explanation of each (`describe_relief`)."""
+        parts = self.articulated.category.canonical().shape
+        axes = torch.stack([principal_directions(part) for part in parts]).double().cpu().numpy()
+        pose, posed = one.object_pose()[:, 0], one.posed()[:, 0]
+        axis, pivot = _joint_lines(one, pose)
+        if one.structure.joint_type != REVOLUTE:
+            axis, pivot = axis[:, :0], pivot[:, :0]
+        arrays = (value.double().cpu().numpy() for value in (dense, posed, pose, pivot, axis))
+        described = []
+        for cloud, shape, *lines in zip(*arrays, strict=True):
+            nearest = kd_tree(shape.reshape(-1, 3)).query(cloud)[1]
+            described.append(describe_relief(cloud, nearest // shape.shape[1], lines[0], axes, *lines[1:]))
+        return torch.from_numpy(np.stack(described)).to(dense)
+
+    @torch.no_grad()
+    def search(
+        self,
+        points: Tensor,  # [B, N, 3] normalised, farthest-point order
+        state_range: Tensor,  # [J, 2] lowest and highest joint state in training
+    ) -> Prediction:
+        """Predictions of the category's shape and joints alone: no network has a say.
+
+        They are searched (`search_articulated`) from the 60 rotations of the icosahedron, those within the orientation
+        range, and from joints in the middle of their range and, in every combination, at either side of it; 3 states
+        for one joint.
+        """
+        with torch.autocast(points.device.type, enabled=False):
+            low, high = state_range.to(points).unbind(-1)
+            middle, side = (low + high) / 2, _SIDE * (high - low)
+            sides = torch.cartesian_prod(*torch.stack([middle - side, middle + side], dim=-1)).view(-1, len(middle))
+            rotations = rotation_group(60).elements.to(points)
+            rotations = rotations[self.observation.orientation.contains(rotations)]
+            shape = self.articulated.category.articulated_shape(self.articulated.joint_type)
+            base, state, error = search_articulated(shape, points, rotations, torch.cat([middle[None], sides]))
+            rotation = base[..., :3, :3]
+            best = self.observation.ranked(error, rotation).argmin(dim=1)
+            allowed = self.observation.orientation.contains(rotation)
+            _, margin = rivals(error, base, best, allowed)
+            found = self.articulated.category_at(base, state).select(best)
+            return self._prediction(found, points, margin)
+
+    def predict_scans(
+        self,
+        clouds: Sequence[np.ndarray],  # each [N, 3], any unit, origin and number of points
         num_points: int,
         radius: tuple[float, float],
         refine: bool | None = None,
-    ) -> ScanEstimate:
-        """Predict a scan of unknown scale: of several within the training clouds' range, the best reconstruction wins.
+    ) -> list[ScanEstimate]:
+        """Predict scans of unknown scale: of several within the training clouds' range, the best reconstruction wins.
+
+        `_SCANS_AT_ONCE` go through networks and registration together, and one's prediction does not depend on others.
 
         Args:
             num_points: See `predict`; registration reads as many as the options say.
             radius: Mean and standard deviation, over normalised training clouds, of the points' mean distance to their
                 centre.
         """
-        cloud, center, _ = normalise_cloud(points, max(num_points, self.inference.points), scale=1.0)
         mean, spread = radius
-        size = float(np.linalg.norm(np.asarray(points, dtype=np.float64) - center, axis=1).mean())
-        scales = [size / (mean + shift * spread) for shift in _SCALE_STARTS]
+        starts = [mean + shift * spread for shift in _SCALE_STARTS]
+        estimates = []
+        for first in range(0, len(clouds), _SCANS_AT_ONCE):
+            estimates += self._predict_together(clouds[first : first + _SCANS_AT_ONCE], num_points, starts, refine)
+        return estimates
+
+    def _predict_together(
+        self,
+        clouds: Sequence[np.ndarray],  # each [N, 3]
+        num_points: int,
+        starts: list[float],  # S mean distances to the centre that each is tried with
+        refine: bool | None,
+    ) -> list[ScanEstimate]:
         device = self.articulated.category.template.device
-        batch = torch.stack([torch.as_tensor(cloud / scale, dtype=torch.float32) for scale in scales]).to(device)
+        centers, scales, tried = [], [], []
+        for points in clouds:
+            cloud, center, _ = normalise_cloud(points, max(num_points, self.inference.points), scale=1.0)
+            size = float(np.linalg.norm(np.asarray(points, dtype=np.float64) - center, axis=1).mean())
+            centers.append(center)
+            scales.append([size / start for start in starts])
+            tried += [torch.as_tensor(cloud / scale, dtype=torch.float32) for scale in scales[-1]]
+        batch = torch.stack(tried).to(device)
         prediction, rival = self.predict_with_rivals(batch, num_points, refine)
-        best = int(relative_error(prediction, batch).argmin())
-        one = slice(best, best + 1)
-        rival = rival[one] if prediction.margin[best] < 1 else None
-        return ScanEstimate(prediction[one], rival, batch[best].cpu().numpy(), center, scales[best])
+        best = relative_error(prediction, batch).view(-1, len(starts)).argmin(dim=1)
+        rows = torch.arange(len(clouds), device=best.device) * len(starts) + best
+        batch, prediction, rival = batch[rows], prediction[rows], rival[rows]
+        scales = [scale[start] for scale, start in zip(scales, best.tolist(), strict=True)]
+        estimates = []
+        for i, (points, center, scale) in enumerate(zip(clouds, centers, scales, strict=True)):
+            one, other = prediction[i : i + 1], rival[i : i + 1]
+            if self.two_ways.learnt:
+                dense = _drawn((np.asarray(points) - center) / scale).to(batch)
+                one, other = self.predict_with_rivals(batch[i : i + 1], num_points, refine, dense[None])
+            other = other if one.margin < 1 else None
+            estimates.append(ScanEstimate(one, other, batch[i].cpu().numpy(), center, scale))
+        return estimates
 
     def _refine(self, last: Iteration, points: Tensor) -> tuple[Hypotheses, Tensor]:
         """The leading hypotheses after articulated registration of the predicted shape, and their errors."""
@@ -273,8 +444,7 @@ class PoseEstimator:
         posed = chosen.posed()[:, 0]
         to_part = distances_to_parts(points, posed)
         shape = (len(points), len(parent))
-        axis, pivot = chosen.axis[:, 0], chosen.pivot
-        parent_pose = pose[:, parent]
+        axis, pivot = _joint_lines(chosen, pose)
         return Prediction(
             part_id=to_part.argmin(dim=-1),
             part_probability=(to_part.square() / (-2 * self.posterior_scale**2)).softmax(dim=-1),
@@ -285,11 +455,35 @@ class PoseEstimator:
             joint_parent=parent.expand(shape),
             joint_child=torch.tensor(chain.child, device=points.device).expand(shape),
             joint_type=torch.full(shape, chosen.structure.joint_type, device=points.device),
-            joint_axis=(parent_pose[..., :3, :3] @ axis[..., None]).squeeze(-1),
-            joint_pivot=transform_points(parent_pose, pivot[:, :, None])[:, :, 0],
+            joint_axis=axis,
+            joint_pivot=pivot,
             joint_state=chosen.state[:, 0],
-            canonical_axis=axis,
-            canonical_pivot=pivot,
+            canonical_axis=chosen.axis[:, 0],
+            canonical_pivot=chosen.pivot,
             reconstruction_error=chamfer(points, posed.flatten(1, 2), bidirectional=self.observation.bidirectional),
             margin=margin,
         )
+
+
+def _joint_lines(
+    one: Hypotheses,  # H = 1
+    pose: Tensor,  # [B, K, 4, 4] canonical object space -> camera space of every part
+) -> tuple[Tensor, Tensor]:  # [B, J, 3], [B, J, 3]
+    """Axes and pivots in camera space."""
+    parent_pose = pose[:, list(one.chain.parent)]
+    axis = (parent_pose[..., :3, :3] @ one.axis[:, 0, ..., None]).squeeze(-1)
+    return axis, transform_points(parent_pose, one.pivot[:, :, None])[:, :, 0]
+
+
+def _exchanged(one: Hypotheses, other: Hypotheses, where: Tensor) -> tuple[Hypotheses, Hypotheses]:
+    """Two explanations of the same clouds (H = 1), exchanged for some clouds [B]."""
+    where = where[:, None, None]
+    base = torch.where(where[..., None], other.base, one.base), torch.where(where[..., None], one.base, other.base)
+    state = torch.where(where, other.state, one.state), torch.where(where, one.state, other.state)
+    return one.at(base[0], state[0]), one.at(base[1], state[1])
+
+
+def _drawn(points: np.ndarray) -> Tensor:
+    """At most as many points [P, 3] of a scan as `two_ways` was learnt from; drawn, since density says something."""
+    chosen = np.random.default_rng(0).permutation(len(points))[:_RELIEF_POINTS]
+    return torch.from_numpy(points[chosen])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
+import torch
 from torch import Tensor
 
 
@@ -32,7 +33,8 @@ class Prediction:
         canonical_pivot: [B, J, 3] the same pivots in canonical object space.
         reconstruction_error: [B] distance between the cloud and its reconstruction (the loss's distance, L1 type).
         margin: [B] in [0, 1], how much better this reconstructs the cloud than the best rival that is turned another
-            way: 1 - error / rival's error; 0 if a rival is as good, 1 if none was considered. No probability.
+            way: 1 - error / rival's error; 0 if a rival is as good, 1 if none was considered. No probability. Where the
+            relief decided between two explanations (`two_ways`), how much likelier than not this one is.
     """
 
     part_id: Tensor
@@ -64,6 +66,11 @@ class Prediction:
     def to(self, device) -> Prediction:
         """Every field on `device`."""
         return Prediction(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
+
+def concatenate(predictions: list[Prediction]) -> Prediction:
+    """Predictions of several batches as one."""
+    return Prediction(**{f.name: torch.cat([getattr(p, f.name) for p in predictions]) for f in fields(Prediction)})
 
 
 @dataclass(frozen=True)

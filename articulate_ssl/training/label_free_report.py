@@ -10,11 +10,11 @@ from torch import Tensor
 from torchmetrics.utilities import dim_zero_cat
 
 from articulate_ssl.inference.pictures.picture import SampleRow, draw_test_samples
-from articulate_ssl.inference.prediction import Prediction
+from articulate_ssl.inference.prediction import Prediction, concatenate
 from articulate_ssl.metrics.label_free import LabelFreeMetrics
 from articulate_ssl.metrics.report import write_report
 from articulate_ssl.training.self_agreement import another_look
-from articulate_ssl.training.test_report import PICTURE_NAME, concatenate, typical
+from articulate_ssl.training.test_report import PICTURE_NAME, typical
 from datamodules.manifest import Manifest
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import logging
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, is_dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,8 @@ from articulate_ssl.network.options import NetworkOptions
 from articulate_ssl.network.rigid_alignment import RigidAlignment
 from articulate_ssl.ops.progress import announced
 from articulate_ssl.shape.observation import Observation
+from articulate_ssl.training.columns import TestColumns
+from articulate_ssl.training.explanations import learn_two_ways
 from articulate_ssl.training.hub import HubWeights
 from articulate_ssl.training.label_free_report import LabelFreeReport
 from articulate_ssl.training.recipes import recipe_class
@@ -60,6 +64,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         inference: Refinement at test time.
         calibration_samples: Training clouds on which `lightning test` relates slots and canonical spaces to labels, and
             from which confidence is learnt without them.
+        two_ways_samples: Training clouds from which the decision between two explanations that fit alike is learnt
+            (`inference.two_ways`), if the category has such; 0 learns none.
         orientation_range: How far objects are turned from their mean orientation at most, in degrees; 180 stands for
             any orientation, less where a camera is held upright.
 
@@ -81,6 +87,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         discovery: DiscoveryOptions = DiscoveryOptions(),  # noqa: B008
         inference: InferenceOptions = InferenceOptions(),  # noqa: B008
         calibration_samples: int = 128,
+        two_ways_samples: int = 800,
         orientation_range: float = 180.0,
     ) -> None:
         super().__init__()
@@ -88,8 +95,14 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         observation = Observation(OrientationRange(orientation_range), objective.unidirectional)
         _check(num_parts, joint_type, observation, schedule)
         self.save_hyperparameters({name: _plain(value) for name, value in options.items()}, logger=False)
+        recipe_type = recipe_class(recipe)
+        if network.state_anchors is None:
+            network = replace(network, state_anchors=recipe_type.state_anchors(num_parts))
+        if inference.refine is None:
+            inference = replace(inference, refine=recipe_type.refines)
         self.category, self.num_parts, self.schedule = category, num_parts, schedule
         self.inference, self.calibration_samples = inference, calibration_samples
+        self.two_ways_samples = two_ways_samples
 
         self.articulated = ArticulatedNetwork(network, num_parts, JOINT_TYPES[joint_type], state_bound=state_range)
         self.rigid = RigidAlignment(network, num_parts * network.shape_points) if schedule.rigid_steps else None
@@ -98,7 +111,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         self.estimator = PoseEstimator(
             self.articulated, self.rigid, iterations, observation, objective.posterior_scale, inference
         )
-        self.recipe = recipe_class(recipe)(self.estimator, objective, schedule, discovery)
+        self.two_ways = self.estimator.two_ways
+        self.recipe = recipe_type(self.estimator, objective, schedule, discovery)
         self.radius = RadiusStatistics()
         self.states = StateRange(num_parts - 1)
         self.confidence = Confidence()
@@ -116,20 +130,26 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
 
     # Prediction
 
-    def predict_points(self, points: Tensor, refine: bool | None = None) -> Prediction:
-        """Predictions for normalised clouds [B, N, 3] in farthest-point order: see `PoseEstimator.predict`."""
-        return self.estimator.predict(points, self.num_points, refine)
-
-    def predict_cloud(
+    def predict_points(
         self,
-        points: np.ndarray,  # [N, 3] any unit and origin
+        points: Tensor,  # [B, N, 3] normalised, farthest-point order
         refine: bool | None = None,
-    ) -> ScanEstimate:
-        """Predict a scan of unknown scale: see `PoseEstimator.predict_scan`."""
+        dense: Tensor | None = None,  # [B, P, 3] the same clouds with all their points
+    ) -> Prediction:
+        """See `PoseEstimator.predict`."""
+        return self.estimator.predict(points, self.num_points, refine, dense)
+
+    def predict_clouds(
+        self,
+        clouds: Sequence[np.ndarray],  # each [N, 3], any unit and origin
+        refine: bool | None = None,
+    ) -> list[ScanEstimate]:
+        """Predict scans of unknown scale: see `PoseEstimator.predict_scans`."""
         radius = float(self.radius.mean), float(self.radius.spread)
-        estimate = self.estimator.predict_scan(points, self.num_points, radius, refine)
-        if not self.confidence.learnt:
-            return estimate
+        estimates = self.estimator.predict_scans(clouds, self.num_points, radius, refine)
+        return [self._with_confidence(estimate) for estimate in estimates] if self.confidence.learnt else estimates
+
+    def _with_confidence(self, estimate: ScanEstimate) -> ScanEstimate:
         probability, unlike = self.confidence_of(estimate.prediction, torch.from_numpy(estimate.points)[None])
         return replace(estimate, probability=float(probability), unlike=float(unlike))
 
@@ -142,10 +162,12 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         error = relative_error(prediction, points.to(prediction.margin))
         return self.confidence.probability(prediction.margin, error), self.confidence.unlike(error)
 
-    def learn_confidence(self) -> None:
-        """Learn from training clouds how far predictions can be trusted (`inference.confidence`)."""
+    def learn_what_predictions_are_worth(self) -> None:
+        """Learn from training clouds which of two explanations is right, and how far predictions can be trusted."""
         training = self.training
         self.eval()
+        if self.two_ways_samples and not self.orientation.limited and self.inference.refine:
+            learn_two_ways(self, self._training_clouds(self.two_ways_samples).to(self.device))
         clouds = self._training_clouds(self.calibration_samples).to(self.device)
         self.confidence.learn(*look_twice(self, clouds))
         self.train(training)
@@ -249,24 +271,36 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
 
     def on_test_start(self) -> None:
         """Relate slots and canonical spaces to the labelled ones, on training clouds; without labels, nothing."""
+        self.test_columns = None
         if not self.trainer.datamodule.manifest.labelled:
+            if self.inference.columns:
+                raise ValueError("inference.columns compares errors, and the set has no labels; leave it out")
             self.test_report = LabelFreeReport(self.predict_points, self.orientation.limited).to(self.device)
             return
         loader = self.trainer.datamodule.calibration_dataloader(self.calibration_samples)
         batches = [self._whole(self.transfer_batch_to_device(batch, self.device, 0)) for batch in loader]
         shown = announced(log, "calibration on training clouds", batches)
-        predictions = [self.predict_points(split_labels(batch)[0]["points"]) for batch in shown]
+        predictions = [self._predict(batch) for batch in shown]
         self.test_report = TestReport(predictions, batches, self.orientation.limited).to(self.device)
+        if self.inference.columns:
+            search = partial(self.estimator.search, state_range=self.state_range)
+            self.test_columns = TestColumns(self._predict, search, self.inference.refine, batches)
 
     def test_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
         """Predict, then compare."""
         batch = self._whole(batch)
         start = time.perf_counter()
-        prediction = self.predict_points(split_labels(batch)[0]["points"])
+        prediction = self._predict(batch)
         seconds = time.perf_counter() - start
         known = self.confidence.learnt
         probability = self.confidence_of(prediction, batch["points"])[0] if known else None
         self.test_report.update(prediction, batch, seconds, probability)
+        if self.test_columns is not None:
+            self.test_columns.update(batch)
+
+    def _predict(self, batch: dict[str, Tensor], refine: bool | None = None) -> Prediction:
+        inputs = split_labels(batch)[0]
+        return self.predict_points(inputs["points"], refine, inputs["dense_points"])
 
     def _whole(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """The batch with as many points as registration reads; the networks still see those that they would."""
@@ -278,8 +312,10 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         folder = Path(self.trainer.log_dir or self.trainer.default_root_dir)
         data = self.trainer.datamodule
         metrics = self.test_report.metrics.compute()  # on every rank: it gathers
+        compared = () if self.test_columns is None else (self.test_columns.compute(metrics, self.test_report),)
         if self.trainer.is_global_zero:
-            self.test_report.write(folder, metrics, data.manifest, str(self.trainer.ckpt_path), self.inference.refine)
+            checkpoint = str(self.trainer.ckpt_path)
+            self.test_report.write(folder, metrics, data.manifest, checkpoint, self.inference.refine, *compared)
 
 
 def _plain(value: Any) -> Any:

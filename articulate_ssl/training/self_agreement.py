@@ -36,7 +36,7 @@ class LearnConfidence(Callback):
     def on_train_batch_end(self, trainer, pl_module: ArticulatedPoseModule, *_) -> None:
         """At the last step only."""
         if trainer.global_step == trainer.max_steps and pl_module.calibration_samples:
-            pl_module.learn_confidence()
+            pl_module.learn_what_predictions_are_worth()
 
 
 def another_look(
@@ -87,7 +87,7 @@ def look_twice(
     for some in announced(log, "learning confidence", clouds.split(_BATCH)):
         again, turn = another_look(some, module.orientation.limited, generator)
         points = some[:, :count], again[:, :count]
-        first, second = (module.predict_points(p) for p in points)
+        first, second = (module.predict_points(p, dense=whole) for p, whole in zip(points, (some, again), strict=True))
         found.append((relative_error(first, points[0]), first.margin, agree(first, second, points, turn)))
     error, margin, agrees = (torch.cat(values) for values in zip(*found, strict=True))
     log.info("%d of %d training clouds are predicted alike a second time", int(agrees.sum()), len(agrees))

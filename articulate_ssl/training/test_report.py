@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from pathlib import Path
 
 import torch
+from rich.console import Console
 from torch import Tensor
 from torchmetrics.utilities import dim_zero_cat
 
 from articulate_ssl.inference.pictures.picture import SampleRow, draw_test_samples
-from articulate_ssl.inference.prediction import Prediction
+from articulate_ssl.inference.prediction import Prediction, concatenate
 from articulate_ssl.metrics.articulated_pose import ArticulatedPoseMetrics
 from articulate_ssl.metrics.calibration import calibrate
 from articulate_ssl.metrics.report import write_report
+from articulate_ssl.training.columns import CSV_NAME, as_csv, as_table
+from datamodules.atomic import atomic_write
 from datamodules.manifest import Manifest
 
 PICTURE_NAME = "test_samples.png"
-
-
-def concatenate(predictions: list[Prediction]) -> Prediction:
-    """Predictions of several batches as one."""
-    return Prediction(**{f.name: torch.cat([getattr(p, f.name) for p in predictions]) for f in fields(Prediction)})
 
 
 def typical(error: Tensor) -> dict[str, int]:
@@ -70,7 +67,15 @@ class TestReport:
             (batch["points"].cpu(), batch["dense_part_id"].gather(1, nearest).cpu(), prediction.to("cpu"))
         )
 
-    def write(self, folder: Path, result: dict, manifest: Manifest, checkpoint: str, refined: bool) -> dict:
+    def write(
+        self,
+        folder: Path,
+        result: dict,
+        manifest: Manifest,
+        checkpoint: str,
+        refined: bool,
+        columns: dict[str, dict] | None = None,
+    ) -> dict:
         """Write metrics.json, metrics.csv and the picture (of this process's clouds); print the table.
 
         Args:
@@ -79,6 +84,7 @@ class TestReport:
             manifest: Of the test set.
             checkpoint: Path of the weights.
             refined: Whether predictions were refined by registration.
+            columns: What `TestColumns.compute` returned, if that was asked for; their table is printed, too.
 
         Returns:
             The content of metrics.json.
@@ -95,7 +101,12 @@ class TestReport:
             part_names=list(manifest.part_names),
             refined=refined,
             calibration=self.calibration.to_dict(),
+            **({} if columns is None else {"columns": columns}),
         )
+        if columns is not None:
+            with atomic_write(folder / CSV_NAME) as file:
+                file.write(as_csv(columns, list(manifest.part_names)).encode())
+            Console().print(as_table(columns, list(manifest.part_names)))
         self._draw(folder / PICTURE_NAME, error)
         return content
 

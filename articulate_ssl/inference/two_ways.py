@@ -1,0 +1,193 @@
+"""One decision for a whole collection: which of two ways of explaining a cloud is the right one.
+
+Laptops can be explained in two ways that fit alike, with the lid as the base and the base as the lid. Single clouds
+cannot settle that, a collection can, without labels: whatever tells the two apart, the *same* way of telling must work
+for all clouds. So from the relief of both explanations of many clouds (`relief`),
+
+1. the *twin* of an explanation: which part lies where the other explanation has which, and how it is turned there.
+   This is the same for all clouds, so the most frequent one among the rivals that predictions come with is taken;
+2. the *decision*: a direction in which the differences of reliefs, whose signs nobody knows, fall into two clusters
+   opposite each other: least kurtosis among whitened principal directions, and from there discriminant analysis on
+   its own answers until these stay. Of several starts the one that parts the clusters best wins.
+
+Which of the two clusters is called right does not matter: slots have no names, and whatever relates them to labels is
+fitted to the answers (`metrics.calibration`).
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+
+import numpy as np
+import roma
+import torch
+from torch import Tensor, nn
+
+from articulate_ssl.geometry.se3 import invert_se3, se3
+
+_ALIKE = np.radians(25)  # rotations closer than this are the same twin
+# Of the clouds, that must have the same twin; and by how much their two explanations may differ in fit. Chosen.
+_COMMON, _CLOSE = 0.5, 0.25
+_CENTERS = 100  # pairs that are tried as the most frequent relation
+_FEWEST = 100  # clouds from which a decision is learnt
+_RIDGE = 0.3  # of discriminant analysis, in units of a standardised feature's variance
+_CAP = 3.0  # standard deviations, beyond which a feature counts as this far
+_COMPONENTS = (2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24)  # whitened principal directions, tried in turn
+_STARTS, _STEPS, _RATE = 64, 80, 0.15  # of the descent to least kurtosis
+_ROUNDS = 50  # of discriminant analysis at most; a handful is taken
+
+log = logging.getLogger(__name__)
+
+
+class TwoWays(nn.Module):
+    """The twin of an explanation, and which of the two is right.
+
+    Attributes:
+        learnt: [] whether there is a decision; otherwise there is no twin.
+        slot: [K] part j of the twin lies where part slot[j] is.
+        turn: [K, 4, 4] T_twin(j) = T(slot[j]) @ turn[j], of poses canonical object space -> cloud.
+        scale: [F] standard deviation of the features' differences.
+        weight: [F] of the standardised differences, in the logarithm of the odds.
+    """
+
+    def __init__(self, num_parts: int, num_features: int) -> None:
+        super().__init__()
+        self.register_buffer("learnt", torch.tensor(False))
+        self.register_buffer("slot", torch.arange(num_parts))
+        self.register_buffer("turn", torch.eye(4).repeat(num_parts, 1, 1))
+        self.register_buffer("scale", torch.ones(num_features))
+        self.register_buffer("weight", torch.zeros(num_features))
+
+    def twin_poses(
+        self,
+        part_pose: Tensor,  # [B, K, 4, 4]
+    ) -> Tensor:  # [B, K, 4, 4]
+        """Part poses of the other explanation, before it is registered."""
+        return part_pose[:, self.slot] @ self.turn.to(part_pose)
+
+    def log_odds(
+        self,
+        one: Tensor,  # [B, F] relief of an explanation
+        other: Tensor,  # [B, F] and of its twin
+    ) -> Tensor:  # [B]
+        """That the first is right; 0 where a relief is not known."""
+        known = ~(one.isnan() | other.isnan()).any(dim=1)
+        difference = torch.nan_to_num((one - other) / self.scale.to(one)).clamp(-_CAP, _CAP)
+        return (difference @ self.weight.to(one)) * known
+
+    def learn_twin(
+        self,
+        chosen: Tensor,  # [n, K, 4, 4] part poses of predictions
+        rival: Tensor,  # [n, K, 4, 4] and of their rivals
+        margin: Tensor,  # [n] `Prediction.margin`
+    ) -> bool:
+        """Take the most frequent relation between explanations that fit alike. False, if there is none."""
+        close = margin < _CLOSE
+        if close.sum() < max(_FEWEST, _COMMON * len(margin)):
+            return False
+        chosen, rival = chosen[close].double(), rival[close].double()
+        # Whose twin is whose is open: both ways are examples.
+        here, there = torch.cat([chosen, rival]), torch.cat([rival, chosen])
+        found = max((_consensus(here, there, slot) for slot in _involutions(chosen.shape[1])), key=lambda one: one[0])
+        share, slot, turn = found
+        log.info("%.0f %% of the clouds that fit in two ways have the same twin", 100 * share)
+        if share * float(close.double().mean()) < _COMMON:
+            return False
+        self.slot.copy_(torch.tensor(slot))
+        self.turn.copy_(turn)
+        return True
+
+    def learn_decision(
+        self,
+        one: Tensor,  # [n, F] relief of explanations
+        other: Tensor,  # [n, F] of their twins
+    ) -> bool:
+        """Find the direction that parts the differences. False, if there are too few."""
+        difference = (one - other).double().cpu().numpy()
+        difference = difference[np.isfinite(difference).all(axis=1)]
+        if len(difference) < _FEWEST:
+            return False
+        scale = np.sqrt((difference**2).mean(axis=0)) + 1e-9
+        weight = decision_direction(np.clip(difference / scale, -_CAP, _CAP))
+        self.scale.copy_(torch.from_numpy(scale))
+        self.weight.copy_(torch.from_numpy(weight))
+        self.learnt.fill_(True)
+        return True
+
+    def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
+        """Weights from before there was a decision have none."""
+        for name, value in self.named_buffers():
+            state_dict.setdefault(prefix + name, value.clone())
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+
+def decision_direction(
+    differences: np.ndarray,  # [n, F] standardised; the sign of each is arbitrary
+) -> np.ndarray:  # [F]
+    """Weights of the logarithm of the odds that a difference is not to be turned round, up to one common sign."""
+    generator = np.random.default_rng(0)
+    _, size, directions = np.linalg.svd(differences, full_matrices=False)
+    least, best = np.inf, None
+    for count in _COMPONENTS:
+        if count > min(differences.shape) // 2:
+            break
+        white = differences @ (directions[:count].T / size[:count] * np.sqrt(len(differences)))
+        weight = _agreeing(differences, np.sign(white @ _least_kurtosis(white, generator)))
+        if (kurtosis := _kurtosis(differences @ weight)) < least:
+            least, best = kurtosis, weight
+    log.info("the two explanations part with a kurtosis of %.2f (1: perfectly, 3: not at all)", least)
+    return best
+
+
+def _least_kurtosis(white: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Unit direction [k] of whitened samples [n, k] along which they have least kurtosis (Pena and Prieto 2001)."""
+    weight = generator.normal(size=(white.shape[1], _STARTS))
+    weight /= np.linalg.norm(weight, axis=0)
+    for _ in range(_STEPS):
+        slope = white.T @ (white @ weight) ** 3 / len(white)
+        weight -= _RATE * (slope - (slope * weight).sum(axis=0) * weight)
+        weight /= np.linalg.norm(weight, axis=0)
+    return weight[:, ((white @ weight) ** 4).mean(axis=0).argmin()]
+
+
+def _agreeing(differences: np.ndarray, sign: np.ndarray) -> np.ndarray:
+    """Weights of discriminant analysis, repeated on its own answers until they stay."""
+    for _ in range(_ROUNDS):
+        turned = sign[:, None] * differences
+        mean = turned.mean(axis=0)
+        spread = np.cov(turned.T) + _RIDGE * np.eye(len(mean))
+        # Two Gaussians at +-mean: the logarithm of the odds is twice the discriminant.
+        weight = 2 * np.linalg.solve(spread, mean)
+        answer = np.sign(differences @ weight)
+        if (answer == sign).all():
+            break
+        sign = answer
+    return weight
+
+
+def _kurtosis(values: np.ndarray) -> float:
+    return float((values**4).mean() / (values**2).mean() ** 2)
+
+
+def _involutions(count: int) -> list[tuple[int, ...]]:
+    """Permutations that undo themselves: a twin's twin is the explanation itself."""
+    every = itertools.permutations(range(count))
+    return [slot for slot in every if all(slot[slot[j]] == j for j in range(count))]
+
+
+def _consensus(
+    here: Tensor,  # [m, K, 4, 4]
+    there: Tensor,  # [m, K, 4, 4]
+    slot: tuple[int, ...],
+) -> tuple[float, tuple[int, ...], Tensor]:  # share, slot, [K, 4, 4]
+    """How many pairs are related by the same turn of every part, and that turn."""
+    turn = invert_se3(here[:, list(slot)]) @ there  # [m, K, 4, 4]
+    rotation = turn[..., :3, :3]
+    centers = rotation[:: max(1, len(rotation) // _CENTERS)]
+    pairs = (len(centers), *rotation.shape)
+    angle = roma.rotmat_geodesic_distance(centers[:, None].expand(pairs), rotation[None].expand(pairs)).amax(dim=-1)
+    near = angle < _ALIKE
+    same = near[near.sum(dim=1).argmax()]
+    mean = roma.special_procrustes(rotation[same].sum(dim=0))
+    return float(same.double().mean()), slot, se3(mean, turn[same][..., :3, 3].median(dim=0).values)

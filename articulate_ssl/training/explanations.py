@@ -1,0 +1,47 @@
+"""What `inference.two_ways` is learnt from: training clouds that can be explained in two ways, without labels."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from articulate_ssl.inference.prediction import Prediction, concatenate
+from articulate_ssl.ops.progress import announced
+
+if TYPE_CHECKING:
+    from articulate_ssl.training.module import ArticulatedPoseModule
+
+_BATCH = 16
+
+log = logging.getLogger(__name__)
+
+
+@torch.no_grad()
+def learn_two_ways(
+    module: ArticulatedPoseModule,
+    clouds: Tensor,  # [n, N, 3] farthest-point order, dense
+) -> None:
+    """Find out whether rivals are alike in all clouds; if so, tell the two apart by the relief of both."""
+    estimator, count = module.estimator, max(module.num_points, module.inference.points)
+    batches = clouds.split(_BATCH)
+    shown = announced(log, "two explanations, their relation", batches)
+    found = [estimator.predict_with_rivals(some[:, :count], module.num_points) for some in shown]
+    chosen, rival = (concatenate(list(several)) for several in zip(*found, strict=True))
+    if not estimator.two_ways.learn_twin(_object_poses(chosen), _object_poses(rival), chosen.margin):
+        log.info("no decision between two explanations: fits tell them apart, or rivals differ from cloud to cloud")
+        return
+    reliefs = [
+        estimator.reliefs(some[:, :count], module.num_points, some) for some in announced(log, "relief", batches)
+    ]
+    if not estimator.two_ways.learn_decision(*(torch.cat(several) for several in zip(*reliefs, strict=True))):
+        log.warning("too few clouds show all parts in both explanations: none is decided")
+
+
+def _object_poses(prediction: Prediction) -> Tensor:
+    """[n, K, 4, 4] canonical object space -> cloud."""
+    pose = prediction.part_pose.clone()
+    pose[..., :3, 3] -= (pose[..., :3, :3] @ prediction.assembly[..., None]).squeeze(-1)
+    return pose

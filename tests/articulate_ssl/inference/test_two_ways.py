@@ -1,0 +1,138 @@
+"""Which of two explanations is right, decided by the collection: the relation, the direction, what is refused."""
+
+import numpy as np
+import pytest
+import roma
+import torch
+
+from articulate_ssl.geometry.se3 import se3
+from articulate_ssl.inference.relief import NUM_FEATURES, describe_relief, roughness
+from articulate_ssl.inference.two_ways import TwoWays, decision_direction
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+def poses(count: int, generator: torch.Generator) -> torch.Tensor:
+    """[count, 2, 4, 4] of two parts that move freely."""
+    turn = roma.unitquat_to_rotmat(
+        torch.nn.functional.normalize(torch.randn(count, 2, 4, generator=generator, dtype=torch.float64), dim=-1)
+    )
+    return se3(turn, torch.randn(count, 2, 3, generator=generator, dtype=torch.float64))
+
+
+def exchange(pose: torch.Tensor) -> torch.Tensor:
+    """Each part where the other was, turned by half a turn about z; done twice, nothing has changed."""
+    half = se3(torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=pose.dtype)), pose.new_zeros(3))
+    return pose[:, [1, 0]] @ half
+
+
+def differences(count: int, generator: torch.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Two clusters at +-1.8 standard deviations along one of 16 directions, next to larger scatter; and the signs."""
+    noise = torch.randn(count, 16, generator=generator, dtype=torch.float64) * torch.linspace(4, 0.5, 16)
+    sign = torch.where(torch.rand(count, generator=generator) < 0.5, -1.0, 1.0)
+    noise[:, 10] += sign * 1.8 * torch.linspace(4, 0.5, 16)[10]
+    return (noise / noise.square().mean(dim=0).sqrt()).numpy(), sign.numpy()
+
+
+def test_parts_that_change_places_are_recognised(generator):
+    chosen = poses(200, generator)
+    rival = exchange(chosen)
+    rival[:20] = poses(20, generator)  # some rivals are of another kind
+    two_ways = TwoWays(2, 4)
+    assert two_ways.learn_twin(chosen, rival, torch.full((200,), 0.05))
+    assert two_ways.slot.tolist() == [1, 0]
+    torch.testing.assert_close(two_ways.twin_poses(chosen[20:]), rival[20:], atol=1e-4, rtol=0)
+    twice = two_ways.twin_poses(two_ways.twin_poses(chosen))
+    torch.testing.assert_close(twice, chosen, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("margin, kind", [(0.05, "any"), (0.8, "exchange")], ids=["no common twin", "fit decides"])
+def test_no_twin_where_there_is_none(generator, margin, kind):
+    chosen = poses(200, generator)
+    rival = exchange(chosen) if kind == "exchange" else poses(200, generator)
+    assert not TwoWays(2, 4).learn_twin(chosen, rival, torch.full((200,), margin))
+
+
+def test_the_direction_that_parts_two_clusters_is_found_without_labels(generator):
+    values, sign = differences(1200, generator)
+    answer = np.sign(values @ decision_direction(values)) == sign
+    assert max(answer.mean(), 1 - answer.mean()) > 0.93
+    # The largest scatter says nothing, which is why principal directions alone do not do.
+    largest = np.sign(values[:, 0]) == sign
+    assert max(largest.mean(), 1 - largest.mean()) < 0.6
+
+
+def test_log_odds_are_antisymmetric_and_say_how_sure(generator):
+    values, sign = differences(1200, generator)
+    one = torch.from_numpy(values)
+    two_ways = TwoWays(1, 16)
+    assert two_ways.learn_decision(one, torch.zeros_like(one))
+    odds = two_ways.log_odds(one, torch.zeros_like(one))
+    torch.testing.assert_close(two_ways.log_odds(torch.zeros_like(one), one), -odds)
+    right = torch.from_numpy(sign).sign() == odds.sign()
+    right = right if right.double().mean() > 0.5 else ~right
+    sure = odds.abs() > odds.abs().median()
+    assert right[sure].double().mean() > 0.99 > right[~sure].double().mean()
+    one[0, 3] = torch.nan
+    assert two_ways.log_odds(one, torch.zeros_like(one))[0] == 0
+
+
+def test_too_few_clouds_decide_nothing(generator):
+    values = torch.from_numpy(differences(60, generator)[0])
+    two_ways = TwoWays(1, 16)
+    assert not two_ways.learn_decision(values, torch.zeros_like(values))
+    assert not two_ways.learnt
+
+
+def test_weights_from_before_there_was_a_decision_load():
+    two_ways = TwoWays(2, 4)
+    two_ways.learnt.fill_(True)
+    two_ways.load_state_dict({})
+    assert two_ways.state_dict().keys() == {"learnt", "slot", "turn", "scale", "weight"}
+
+
+def plate(generator: torch.Generator, rough: float) -> np.ndarray:
+    """[1000, 3]: both faces of a plate 1 x .6 x .2, the upper one as rough as said."""
+    points = torch.rand(1000, 3, generator=generator, dtype=torch.float64) - 0.5
+    points[:, 2] = 0.1 * torch.where(points[:, 2] > 0, 1.0, -1.0)
+    points[:, 2] += (points[:, 2] > 0) * rough * torch.randn(1000, generator=generator, dtype=torch.float64)
+    return (points * torch.tensor([1.0, 0.6, 1.0])).numpy()
+
+
+def test_relief_moves_with_the_parts_and_knows_them_apart(generator):
+    rough, flat = plate(generator, 0.006), plate(generator, 0.0)
+    points, label = np.concatenate([rough, flat]), np.repeat([0, 1], 1000)
+    pose = poses(1, generator)[0].numpy()
+    posed = np.concatenate([p @ pose[k, :3, :3].T + pose[k, :3, 3] for k, p in enumerate((rough, flat))])
+    axes = np.stack([np.eye(3)[:, [2, 1, 0]]] * 2)  # thin, middle, long
+    nowhere = np.zeros((0, 3))
+    still = describe_relief(points, label, np.stack([np.eye(4)] * 2), axes, nowhere, nowhere)
+    assert still.shape == (2 * NUM_FEATURES,)
+    # Neighbours of a point are found among its own part's points, so that moving parts apart changes nothing.
+    np.testing.assert_allclose(describe_relief(posed, label, pose, axes, nowhere, nowhere), still, atol=1e-4)
+    assert np.median(roughness(rough)[rough[:, 2] > 0, 0]) > np.median(roughness(flat)[:, 0]) + 1
+
+
+def test_what_lies_next_to_a_joint_is_left_out(generator):
+    points = plate(generator, 0.003)
+    whole = np.stack([np.eye(4)]), np.stack([np.eye(3)[:, [2, 1, 0]]])
+    label = np.zeros(len(points), dtype=int)
+    line = np.array([[0.0, -0.3, 0.0]]), np.array([[1.0, 0.0, 0.0]])
+    far = points[np.hypot(points[:, 1] + 0.3, points[:, 2]) > 0.12]
+    nowhere = np.zeros((0, 3))
+    near = describe_relief(points, label, *whole, *line)
+    without = describe_relief(far, label[: len(far)], *whole, nowhere, nowhere)
+    np.testing.assert_allclose(near, without)
+    assert near[1] < describe_relief(points, label, *whole, nowhere, nowhere)[1] - 0.05  # the middle extent
+
+
+def test_a_lost_part_has_no_relief(generator):
+    points = plate(generator, 0.0)
+    label = np.zeros(len(points), dtype=int)
+    label[:30] = 1
+    axes, nowhere = np.stack([np.eye(3)] * 2), np.zeros((0, 3))
+    found = describe_relief(points, label, np.stack([np.eye(4)] * 2), axes, nowhere, nowhere)
+    assert np.isnan(found[NUM_FEATURES:]).all() and np.isfinite(found[:NUM_FEATURES]).all()
