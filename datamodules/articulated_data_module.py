@@ -27,6 +27,8 @@ class ArticulatedDataModule(LightningDataModule):
         sample           [B] index of the sample in its split
         dense_points     [B, P, 3] all stored points; in training only with `dense_in_fit`
         dense_part_id    [B, P] part of each of them
+        occupancy_points [B, M, 3] points around the object; only in training and validation with `occupancy`
+        occupancy        [B, M] 1 for those inside it, else 0
 
     and, for metrics only, every other array of `datamodules.shards.SHARD_ARRAYS` under its own name, integers as int64;
     without labels (`manifest.labelled`) only those of `UNLABELLED_ARRAYS`, and no `dense_part_id`.
@@ -55,6 +57,8 @@ class ArticulatedDataModule(LightningDataModule):
         dense_in_fit: Deliver the dense arrays in training and validation too.
         calibration_set: Folder of the set whose training clouds calibrate metrics, if not this set's own: what the
             network was trained on, when it is tested on objects or views from elsewhere.
+        occupancy: Deliver occupancy samples in training and validation; the set must have them
+            (`datamodules.occupancy`).
         verify: Compare every shard with its checksum when a stage begins.
 
     Raises:
@@ -79,6 +83,7 @@ class ArticulatedDataModule(LightningDataModule):
         max_test_samples: int | None = None,
         dense_in_fit: bool = False,
         calibration_set: str | None = None,
+        occupancy: bool = False,
         verify: bool = True,
     ) -> None:
         super().__init__()
@@ -130,7 +135,7 @@ class ArticulatedDataModule(LightningDataModule):
         self.__dict__.pop("manifest", None)
         if stage in ("fit", "validate"):
             common |= {"noise_std": options.noise_std, "dense": options.dense_in_fit, "seed": options.seed}
-            common["rotate"] = self.manifest.view == "complete"
+            common |= {"rotate": self.manifest.view == "complete", "occupancy": options.occupancy}
             self.train_set = ArticulatedDataset(split="train", **common)
             if stage == "fit":
                 self.consumed_samples = 0

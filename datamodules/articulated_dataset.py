@@ -14,7 +14,8 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from articulate_ssl.geometry.se3 import se3
-from datamodules.manifest import Manifest
+from datamodules.manifest import Manifest, ShardEntry
+from datamodules.occupancy import REMEDY, OccupancyError, OccupancyIndex, open_samples, samples_path
 from datamodules.shards import SHARD_ARRAYS, UNLABELLED_ARRAYS, ShardError, read_shard, sha256_of
 
 POINT_ARRAYS = ("points", "part_id")
@@ -46,6 +47,7 @@ class ArticulatedDataset(Dataset):
         noise_std: Standard deviation of Gaussian noise per coordinate, in normalised units.
         dense: Also deliver `dense_points` and `dense_part_id`.
         seed: Of rotation and noise.
+        occupancy: Also deliver `occupancy_points` and `occupancy`, of a set that has them (`datamodules.occupancy`).
         verify: Compare every shard with its checksum, once per file and process.
 
     Raises:
@@ -62,9 +64,10 @@ class ArticulatedDataset(Dataset):
         noise_std: float = 0.0,
         dense: bool = True,
         seed: int = 0,
+        occupancy: bool = False,
         verify: bool = True,
     ) -> None:
-        self._options = (folder, split, num_points, rotate, noise_std, dense, seed)
+        self._options = (folder, split, num_points, rotate, noise_std, dense, seed, occupancy)
         self.num_points, self.rotate, self.noise_std, self.dense, self.seed = num_points, rotate, noise_std, dense, seed
         manifest = Manifest.load(folder)
         if not manifest.shards[split]:
@@ -86,6 +89,9 @@ class ArticulatedDataset(Dataset):
         names = [name for name in LABEL_ARRAYS if manifest.labelled or name in UNLABELLED_ARRAYS]
         self.labels = {name: np.concatenate([shard[name] for shard in shards]) for name in names}
         self._starts = np.cumsum([0] + [len(points) for points in self._points])
+        self._occupancy = (
+            self._open_occupancy(Path(folder), split, manifest.shards[split], verify) if occupancy else None
+        )
 
     @staticmethod
     def _open(path: Path, samples: int, sha256: str, verify: bool) -> dict[str, np.ndarray]:
@@ -97,6 +103,21 @@ class ArticulatedDataset(Dataset):
         if len(shard["points"]) != samples:
             raise ShardError(f"{path}: shard has {len(shard['points'])} samples, the manifest says {samples}.")
         return shard
+
+    @staticmethod
+    def _open_occupancy(folder: Path, split: str, shards: Sequence[ShardEntry], verify: bool) -> list[np.ndarray]:
+        """The occupancy samples of all shards."""
+        index = OccupancyIndex.load(folder)
+        samples = []
+        for shard in shards:
+            path, entry = samples_path(folder, split, shard.name), index.find(split, shard)
+            if entry is None:
+                raise OccupancyError(f"{path}: has no occupancy samples of {split} shard {shard.name}. {REMEDY}")
+            samples.append(open_samples(path, shard.samples, index.points))
+            status = path.stat()
+            if verify and _cached_sha256(path.resolve(), status.st_mtime_ns, status.st_size) != entry.sha256:
+                raise OccupancyError(f"{path}: is damaged, its SHA-256 is not that of the index. {REMEDY}")
+        return samples
 
     def __getstate__(self) -> tuple:
         """Workers map the shards themselves instead of receiving them."""
@@ -121,6 +142,10 @@ class ArticulatedDataset(Dataset):
         batch = {name: torch.from_numpy(_widen(array[index])) for name, array in self.labels.items()}
         if self.dense and self._part_id is not None:
             batch["dense_part_id"] = torch.from_numpy(_widen(self._gather(self._part_id, shard, row)))
+        if self._occupancy is not None:
+            samples = [self._occupancy[s][r] for s, r in zip(shard.tolist(), row.tolist(), strict=True)]
+            samples = torch.from_numpy(np.stack(samples).astype(np.float32))
+            batch |= {"occupancy_points": samples[..., :3], "occupancy": samples[..., 3]}
         points = self._augment(points, batch, keys)
         if self.dense:
             batch["dense_points"] = points
@@ -149,6 +174,8 @@ class ArticulatedDataset(Dataset):
             rotation = roma.unitquat_to_rotmat(quaternion / quaternion.norm(dim=-1, keepdim=True)).float()
             points = points @ rotation.mT
             batch["center"] = (rotation @ batch["center"][..., None]).squeeze(-1)
+            if self._occupancy is not None:
+                batch["occupancy_points"] = batch["occupancy_points"] @ rotation.mT
             if self._part_id is None:
                 return points
             for name in ("joint_axis", "joint_pivot"):

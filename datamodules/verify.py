@@ -20,7 +20,8 @@ from rich.progress import track
 from articulate_ssl.geometry.kinematic_chain import forward_kinematics
 from articulate_ssl.geometry.screw import REVOLUTE, screw_motion
 from datamodules.manifest import SPLITS, Manifest, ManifestError
-from datamodules.shards import ShardError, read_shard
+from datamodules.occupancy import FOLDER, REMEDY, OccupancyError, OccupancyIndex, open_samples, samples_path
+from datamodules.shards import ShardError, read_shard, sha256_of
 
 TOLERANCE = 1e-4  # a few hundred float32 roundings of values of size 1
 
@@ -60,7 +61,31 @@ def verify_set(
         if len(arrays["scale"]) != entry.samples:
             problems.append(f"{path}: has {len(arrays['scale'])} samples, the manifest says {entry.samples}")
         problems += [f"{path}: {problem}" for problem in label_problems(arrays, manifest, split)]
-    return problems
+    return problems + list(occupancy_problems(folder, manifest))
+
+
+def occupancy_problems(folder: Path, manifest: Manifest) -> Iterator[str]:
+    """What is wrong with a set's occupancy samples; a set need not have any."""
+    if not (folder / FOLDER).exists():
+        return
+    try:
+        index = OccupancyIndex.load(folder)
+    except OccupancyError as error:
+        yield str(error)
+        return
+    shards = {(split, shard.name): shard for split in SPLITS for shard in manifest.shards[split]}
+    for entry in index.entries:
+        path, shard = samples_path(folder, entry.split, entry.shard), shards.get((entry.split, entry.shard))
+        if shard is None or shard.sha256 != entry.shard_sha256:
+            yield f"{path}: {entry.split} shard {entry.shard} is not the one that these samples were drawn for"
+            continue
+        try:
+            open_samples(path, shard.samples, index.points)
+        except OccupancyError as error:
+            yield str(error)
+            continue
+        if sha256_of(path) != entry.sha256:
+            yield f"{path}: is damaged, its SHA-256 is not that of the index. {REMEDY}"
 
 
 def label_problems(arrays: Arrays, manifest: Manifest, split: str) -> Iterator[str]:

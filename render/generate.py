@@ -31,6 +31,7 @@ from render.depth_renderer import DepthRenderer, RendererUnavailable
 from render.execution import run_tasks
 from render.journal import JOURNAL_NAME, Journal, described, require_same_options
 from render.object_set import ObjectSet, plan_objects
+from render.occupancy import write_occupancy
 from render.partial_cloud import RENDERERS
 from render.progress import with_progress
 from render.scan_set import ScanSet, ScanSetOptions, plan_scans
@@ -41,6 +42,7 @@ from render.training_config import joint_type_of, write_training_config
 # Options of posed objects only, and their defaults; scans have been posed and seen already.
 OBJECT_OPTIONS = {
     "variant": None, "states": 100, "views": 10, "resolution": None, "renderer": "auto", "noise_std": 0.0,
+    "occupancy": 0,
 }  # fmt: skip
 # Options of scans only.
 SCAN_OPTIONS = {"parts": None, "joint": None, "normalise": None}
@@ -48,8 +50,10 @@ SCAN_OPTIONS = {"parts": None, "joint": None, "normalise": None}
 SetPlan = ObjectSet | ScanSet
 
 
-def generate(plan: SetPlan, out: Path, workers: int, scheduler: str | None = None) -> Path:
+def generate(plan: SetPlan, out: Path, workers: int, scheduler: str | None = None, occupancy: int = 0) -> Path:
     """Make, complete or repair a data set and return its folder.
+
+    With `occupancy`, training clouds of posed objects get so many occupancy samples each, in files of their own.
 
     Raises:
         ValueError: if an instance is unsound, or the folder holds a set made with other options.
@@ -68,6 +72,8 @@ def generate(plan: SetPlan, out: Path, workers: int, scheduler: str | None = Non
             _repair(folder, plan, workers, scheduler)
         else:
             _complete(folder, plan, workers, scheduler)
+        if occupancy:
+            write_occupancy(plan, folder, occupancy, workers, scheduler)
     return folder
 
 
@@ -159,6 +165,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--renderer", choices=("auto", *RENDERERS), help="of partial views (default: auto, which is egl if it works)")
     add("--noise-std", type=float, help="of depth, in rest-state bounding-box diagonals (default: 0)")
+    add("--occupancy", type=_at_least(0), help="samples inside and outside every training cloud's object (default: 0)")
     group = parser.add_argument_group("your own scans, --source clouds", argument_default=argparse.SUPPRESS)
     add = group.add_argument
     add("--parts", type=_at_least(2), help="number of parts of a category that has no specification")
@@ -291,7 +298,8 @@ def main(argv: list[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     try:
         plan = plan_from(arguments)
-        folder = generate(plan, arguments.out, arguments.workers, arguments.scheduler)
+        occupancy = getattr(arguments, "occupancy", OBJECT_OPTIONS["occupancy"])
+        folder = generate(plan, arguments.out, arguments.workers, arguments.scheduler, occupancy)
         manifest = Manifest.load(folder)
         lines = _training_lines(plan, folder, arguments.out)
     except (ValueError, OSError) as error:

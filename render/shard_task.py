@@ -163,7 +163,7 @@ def make_shard(task: ShardTask) -> ShardResult:
         OSError: if the shard cannot be written.
     """
     options = task.options
-    instance = _load_instance(options, task.instance_id)
+    instance = load_instance(options, task.instance_id)
     ranges = options.spec.sampled_ranges(instance)
     all_states = sample_states(ranges, options.states, _generator(task, "states"))
     make_samples = _partial_samples if options.view == "partial" else _complete_samples
@@ -213,7 +213,7 @@ class ObjectCheck:
     def make(self) -> Reading:
         """Whether shards can be made of it."""
         try:
-            instance = _load_instance(self.options, self.instance_id)
+            instance = load_instance(self.options, self.instance_id)
             if self.options.view == "complete":
                 _reachable_surface(self.options, "check", self.instance_id)
             else:
@@ -279,7 +279,7 @@ def _stack(samples: list[dict[str, np.ndarray]], instance: ArticulatedObject, in
 
 
 @lru_cache(maxsize=1)
-def _load_instance(options: SetOptions, instance_id: str) -> ArticulatedObject:
+def load_instance(options: SetOptions, instance_id: str) -> ArticulatedObject:
     """The validated instance in its category's rest state; kept for the next shard of the same instance."""
     return options.spec.to_rest(options.open().load(instance_id).validate())
 
@@ -287,7 +287,7 @@ def _load_instance(options: SetOptions, instance_id: str) -> ArticulatedObject:
 @lru_cache(maxsize=1)
 def _reachable_surface(options: SetOptions, split: str, instance_id: str) -> ReachableSurface:
     """The instance's pool of reachable points; kept for the next shard of the same instance."""
-    instance = _load_instance(options, instance_id)
+    instance = load_instance(options, instance_id)
     rng = generator_for(options.seed, split, instance_id, "surface")
     states = sample_states(options.spec.sampled_ranges(instance), _REACH_STATES, rng)
     return ReachableSurface(instance, states, rng)
@@ -298,7 +298,7 @@ def _depth_sensor(options: SetOptions, instance_id: str) -> DepthSensor:
     """The sensor that looks at the instance; kept for the next shard of the same instance."""
     spec = options.spec
     return DepthSensor(
-        _load_instance(options, instance_id),
+        load_instance(options, instance_id),
         spec.view,
         renderer=options.renderer,
         protocol=options.protocol,

@@ -4,17 +4,11 @@ Paper, appendix "Oracle ICP". What it leaves open is decided here: point-to-poin
 `Options.correspondence_distance`; the same five templates for every test cloud; templates at rest; on partial clouds a
 template is the union of several training views of its instance, and the ten initial translations are the observed
 centroid and nine Gaussian offsets from it. A hypothesis without any correspondence never wins.
-
-    python -m articulate_ssl.baselines.oracle_icp --root data --category laptop --samples 64
 """
 
 from __future__ import annotations
 
-import argparse
-import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import open3d as o3d
@@ -22,13 +16,21 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from articulate_ssl.baselines.perfect_oracle import part_points, perfect_oracle
+from articulate_ssl.baselines.method import (
+    PART_LABELS,
+    PART_POSES,
+    POSES,
+    SEGMENTATION,
+    TEST_PARTS,
+    Effort,
+    Method,
+    Problem,
+)
+from articulate_ssl.baselines.perfect_oracle import part_points
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
 from articulate_ssl.inference.prediction import Prediction
-from articulate_ssl.metrics import ArticulatedPoseMetrics, calibrate
 from articulate_ssl.metrics.functional import nearest_index
-from articulate_ssl.metrics.report import write_report
 from datamodules.articulated_data_module import ArticulatedDataModule
 from datamodules.articulated_dataset import ArticulatedDataset
 
@@ -43,42 +45,39 @@ class Options:
 
     Attributes:
         initial_rotations: Size of the rotation group that initial rotations come from (paper: 60).
-        initial_translations: 1 for complete clouds, 10 for partial ones (paper).
+        initial_translations: 1 for complete clouds (paper).
+        partial_translations: The same for partial clouds (paper: 10).
         translation_std: Standard deviation of the offsets of all initial translations but the first.
         correspondence_distance: Largest distance of corresponding points, in cloud units.
         iterations: ICP iterations at most.
+        templates: Training instances that are registered (paper: 5).
+        template_views: Most views of partial clouds that a template is the union of.
         template_points: Points of every template part.
         screen: Not in the paper. If set, all hypotheses first run with few points and iterations (`SCREEN_POINTS`,
             `SCREEN_ITERATIONS`), and only this many, those with the smallest inlier RMSE, run in full.
+        partial_screen: The same for partial clouds, ten times as much work.
         seed: Of templates, point subsets and initial translations.
     """
 
     initial_rotations: int = 60
     initial_translations: int = 1
+    partial_translations: int = 10
     translation_std: float = 0.1
     correspondence_distance: float = 0.2
     iterations: int = 30
+    templates: int = 5
+    template_views: int = 10
     template_points: int = 256
     screen: int | None = None
+    partial_screen: int | None = 60
     seed: int = 0
-
-
-@dataclass(frozen=True)
-class Template:
-    """A training shape by parts.
-
-    Attributes:
-        parts: [K, M, 3] points of every part at rest, relative to the part's bounding-box centre, in the object's axes.
-    """
-
-    parts: Tensor
 
 
 def make_template(
     labels: dict[str, Tensor],
     options: Options,
-) -> Template:
-    """Union of V views of one instance, every part moved back to rest.
+) -> Tensor:  # [K, M, 3]
+    """Parts of one instance in V views, moved back to rest: the object's axes, about each part's bounding-box centre.
 
     Args:
         labels: shard arrays of V clouds of the same instance; views of unequal `scale` are brought to their mean.
@@ -92,7 +91,7 @@ def make_template(
         points, part_id = centred.flatten(0, 1), labels["dense_part_id"].flatten()
         order = torch.randperm(len(points), generator=generator)
         parts.append(part_points(points[order], part_id[order], k, options.template_points, points.new_zeros(3)))
-    return Template(torch.stack(parts))
+    return torch.stack(parts)
 
 
 def point_cloud(points: Tensor) -> o3d.geometry.PointCloud:
@@ -146,60 +145,82 @@ def register_part(
     return pose, rmse
 
 
-def oracle_icp(
-    labels: dict[str, Tensor],
-    templates: Sequence[Template],
-    options: Options,
-) -> Prediction:
-    """Part poses by registration of ground-truth parts; ICP predicts no joints, so the prediction has none (J = 0).
+class OracleICP(Method):
+    """Part poses by registration of ground-truth parts to parts of training shapes; nothing is said about joints.
 
-    Canonical part spaces are the perfect oracle's, so both share one calibration: labelled axes, and the bounding-box
-    centre of the winning template's part as origin. A part that was not observed at all is put on the cloud's centroid,
-    unrotated.
+    Canonical part spaces are the perfect oracle's: labelled axes, and the bounding-box centre of the winning template's
+    part as origin. A part that was not observed at all is put on the cloud's centroid, unrotated.
 
     Args:
-        labels: shard arrays of B test clouds; of these `points`, and the true part of every point.
-        templates: shapes to register.
-        options: how.
+        problem: What is known of the category.
+        options: How it runs; on partial clouds with `partial_translations` initial translations.
     """
-    truth = perfect_oracle(labels)
-    points, num_parts = labels["points"], truth.num_parts
-    pose, shape = register_parts(points, truth.part_id, templates, options)
-    posed = transform_points(pose, shape)  # [B, K, M, 3]
-    distance = torch.stack([nearest_index(points, posed[:, k])[0] for k in range(num_parts)], dim=-1)  # [B, N, K]
-    part_id = distance.argmin(-1)
-    return replace(
-        truth,
-        part_id=part_id,
-        part_probability=one_hot(part_id, num_parts).to(points.dtype),
-        part_pose=pose,
-        part_shape=shape,
-        base_pose=pose[:, 0],
-        reconstruction_error=distance.amin(-1).mean(-1).to(points.dtype),
-        **_no_joints(points),
-    )
+
+    title = "Oracle ICP"
+    given = (PART_LABELS, PART_POSES, TEST_PARTS)
+    says = (SEGMENTATION, POSES)
+    effort = Effort(steps=0, batch_size=16, learning_rate=0.0)
+    labelled_spaces = True
+
+    def __init__(self, problem: Problem, options: Options = Options()) -> None:
+        super().__init__(problem)
+        self.options = options
+        self.register_buffer("templates", torch.zeros(0, problem.num_parts, options.template_points, 3))
+        self.register_buffer("partial", torch.tensor(False))
+
+    def prepare(self, data: ArticulatedDataModule, seed: int) -> None:
+        """Templates of randomly chosen training instances."""
+        train = ArticulatedDataset(data.folder, "train", num_points=self.problem.num_points)
+        self.partial = torch.tensor(data.hparams.view == "partial")
+        views = self.options.template_views if self.partial else 1
+        chosen = choose_views(train.labels["instance"], self.options.templates, views, seed)
+        self.templates = torch.stack([make_template(train.__getitems__(v.tolist()), self.options) for v in chosen])
+
+    def predict(self, batch: dict[str, Tensor]) -> Prediction:
+        """The best of all templates for each part; every point takes the part that is nearest to it then."""
+        points = batch["points"].cpu()
+        nearest = nearest_index(points, batch["dense_points"].cpu())[1]
+        part_id = batch["dense_part_id"].cpu().long().gather(1, nearest)
+        options = self.options
+        if self.partial:
+            options = replace(options, initial_translations=options.partial_translations, screen=options.partial_screen)
+        pose, shape = register_parts(points, part_id, self.templates.cpu(), options)
+        posed = transform_points(pose, shape)  # [B, K, M, 3]
+        parts = range(self.problem.num_parts)
+        distance = torch.stack([nearest_index(points, posed[:, k])[0] for k in parts], dim=-1)  # [B, N, K]
+        part_id = distance.argmin(-1)
+        return Prediction(
+            part_id=part_id,
+            part_probability=one_hot(part_id, self.problem.num_parts).to(points.dtype),
+            part_pose=pose,
+            part_shape=shape,
+            assembly=torch.zeros_like(pose[..., :3, 3]),
+            base_pose=pose[:, 0],
+            reconstruction_error=distance.amin(-1).mean(-1).to(points.dtype),
+            margin=points.new_ones(len(points)),
+            **_no_joints(points),
+        )
 
 
 def register_parts(
     points: Tensor,  # [B, N, 3]
     part_id: Tensor,  # [B, N] true part of every point
-    templates: Sequence[Template],
+    templates: Tensor,  # [T, K, M, 3]
     options: Options,
 ) -> tuple[Tensor, Tensor]:  # [B, K, 4, 4], [B, K, M, 3]
-    """Pose and shape of the template that fits each part of each cloud best; see `oracle_icp` for unobserved parts."""
-    clouds, num_parts = len(points), len(templates[0].parts)
+    """Pose and shape of the template that fits each part of each cloud best; see `OracleICP` for unobserved parts."""
+    clouds, num_parts = len(points), templates.shape[1]
     pose = torch.eye(4, dtype=points.dtype).repeat(clouds, num_parts, 1, 1)
     pose[..., :3, 3] = points.mean(1)[:, None]
-    shape = torch.stack([templates[0].parts] * clouds)
+    shape = templates[0].repeat(clouds, 1, 1, 1)
     for b in range(clouds):
         for k in range(num_parts):
             observed = points[b][part_id[b] == k]
             if len(observed) == 0:
                 continue
-            results = [(*register_part(t.parts[k], observed, options), t) for t in templates]
-            best, _, template = min(results, key=lambda r: r[1])
+            results = [(*register_part(template, observed, options), template) for template in templates[:, k]]
+            best, _, shape[b, k] = min(results, key=lambda result: result[1])
             pose[b, k] = torch.from_numpy(best.copy())
-            shape[b, k] = template.parts[k]
     return pose, shape
 
 
@@ -232,92 +253,3 @@ def choose_views(
     chosen = generator.choice(available, size=min(templates, len(available)), replace=False)
     members = [np.flatnonzero(instance == i) for i in chosen]
     return [generator.choice(m, size=min(views, len(m)), replace=False) for m in members]
-
-
-def _score(
-    data: ArticulatedDataModule,
-    train: ArticulatedDataset,
-    templates: Sequence[Template],
-    options: Options,
-) -> tuple[dict, float]:
-    """Metrics over the test clouds, calibrated on training clouds; and the seconds that all predictions took."""
-    labels = train.__getitems__(np.linspace(0, len(train) - 1, min(len(train), 128)).astype(int).tolist())
-    metrics = ArticulatedPoseMetrics(calibrate(perfect_oracle(labels), labels))
-    seconds = 0.0
-    for batch in data.test_dataloader():
-        start = time.perf_counter()
-        prediction = oracle_icp(batch, templates, options)
-        seconds += time.perf_counter() - start
-        metrics.update(prediction, batch)
-    return metrics.compute(), seconds
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run Oracle ICP on the test split of a generated set and report it like a network."""
-    parser = _parser()
-    args = parser.parse_args(arguments)
-    partial = args.view == "partial"
-    protocol = args.protocol or "honest" if partial else None
-    try:
-        data, train = _open_data(args, protocol)
-    except ValueError as error:
-        parser.error(str(error))
-    options = Options(
-        initial_translations=10 if partial else 1,
-        correspondence_distance=args.distance,
-        screen=args.screen,
-        seed=args.seed,
-    )
-    views = choose_views(train.labels["instance"], args.templates, args.template_views if partial else 1, args.seed)
-    templates = [make_template(train.__getitems__(v.tolist()), options) for v in views]
-    result, seconds = _score(data, train, templates, options)
-    write_report(
-        args.out,
-        result,
-        category=args.category,
-        source=args.source,
-        protocol=protocol or "complete",
-        checkpoint=None,
-        seconds_per_cloud=seconds / result["samples"],
-        method="Oracle ICP",
-        screen=args.screen,
-        part_names=list(data.manifest.part_names),
-    )
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser("python -m articulate_ssl.baselines.oracle_icp", description=main.__doc__)
-    parser.add_argument("--root", default="data", help="folder that `make data` wrote to")
-    parser.add_argument("--category", required=True)
-    parser.add_argument("--source", default="procedural")
-    parser.add_argument("--view", default="complete", choices=("complete", "partial"))
-    parser.add_argument("--protocol", default=None, choices=("honest", "eap"))
-    parser.add_argument("--samples", type=int, default=64, help="test clouds, spread over instances and states")
-    parser.add_argument("--points", type=int, default=512, help="points per cloud")
-    parser.add_argument("--templates", type=int, default=5)
-    parser.add_argument("--template-views", type=int, default=10, help="views per template of partial clouds")
-    parser.add_argument("--distance", type=float, default=Options.correspondence_distance)
-    parser.add_argument("--screen", type=int, default=None, help="not in the paper: refine only so many")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path("build/oracle_icp"), help="folder of the report")
-    return parser
-
-
-def _open_data(args: argparse.Namespace, protocol: str | None) -> tuple[ArticulatedDataModule, ArticulatedDataset]:
-    """The test clouds, and the training clouds of the same set."""
-    data = ArticulatedDataModule(
-        args.category,
-        args.root,
-        args.source,
-        args.view,
-        protocol,
-        num_points=args.points,
-        batch_size=8,
-        max_test_samples=args.samples,
-    )
-    data.setup("test")
-    return data, ArticulatedDataset(data.folder, "train", num_points=args.points)
-
-
-if __name__ == "__main__":
-    main()
