@@ -3,13 +3,15 @@ SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup data preview test lint bench demo weights weights-check clean
+.PHONY: help setup data preview test lint bench compare demo weights weights-check clean
 
 PYTHON ?= python3
 CLUSTER ?=
 ARGS ?=
 CATEGORIES ?=
 VIEWS ?=
+METHODS ?=
+SEEDS ?= 1
 
 VIEW ?= complete
 SOURCE ?= procedural
@@ -18,6 +20,9 @@ OUT ?= data
 WORKERS ?=
 SEED ?= 0
 PROTOCOL ?=
+JOBS ?= logical
+# Each takes a gigabyte.
+most_jobs := 8
 
 bin := .venv/bin
 packages := .venv/.packages
@@ -34,9 +39,9 @@ demo_shard = build/demo/data/laptop/$(1)/test/shard-00000.npz
 
 needs := $(packages) $(if $(filter 1,$(CLUSTER)),$(cluster))
 
-ifneq ($(filter data preview,$(MAKECMDGOALS)),)
+ifneq ($(filter data preview compare,$(MAKECMDGOALS)),)
 ifndef CAT
-$(error make $(filter data preview,$(MAKECMDGOALS)) needs a category, as in: make data CAT=laptop)
+$(error make $(filter data preview compare,$(MAKECMDGOALS)) needs a category, as in: make data CAT=laptop)
 endif
 endif
 
@@ -60,9 +65,10 @@ data: $(needs) ## Generate a data set: CAT=laptop [VIEW SOURCE ROOT OUT WORKERS 
 preview: $(needs) ## Draw a contact sheet of a category into build/preview: CAT=laptop [SOURCE ROOT SEED ARGS].
 	$(bin)/python -m render.preview --category '$(CAT)' --source '$(SOURCE)' --seed '$(SEED)' $(if $(ROOT),--root '$(ROOT)') $(ARGS)
 
-test: $(needs) ## Set up without compiling (CLUSTER=1 compiles), then run the tests. [ARGS="options of pytest"]
+# A process per core, and one thread in each: small tensors gain nothing from more. Files stay whole, for their fixtures.
+test: $(needs) ## Set up without compiling (CLUSTER=1 compiles), then run the tests. [JOBS=logical ARGS="options of pytest"]
 	@.ci/setup browser
-	$(bin)/python -m pytest $(ARGS)
+	OMP_NUM_THREADS=1 $(bin)/python -m pytest --numprocesses '$(JOBS)' --maxprocesses $(most_jobs) --dist loadfile $(ARGS)
 
 lint: $(needs) ## Check style and formatting.
 	$(bin)/ruff check .
@@ -70,6 +76,9 @@ lint: $(needs) ## Check style and formatting.
 
 bench: $(needs) ## Measure speed and memory: prints a table, writes build/bench.json. [ARGS="--device cuda"]
 	$(bin)/python -m articulate_ssl.benchmark $(ARGS)
+
+compare: $(needs) ## Train and test every method on the same clouds, can be interrupted: CAT=laptop or all [VIEW SEEDS METHODS="npcs_epn staged" ROOT OUT=build/compare WORKERS=1 ARGS].
+	$(bin)/python -m articulate_ssl.comparison --categories $(CAT) --view '$(VIEW)' --seeds '$(SEEDS)' $(if $(METHODS),--methods $(METHODS)) $(if $(ROOT),--root '$(ROOT)') $(if $(filter command,$(origin OUT)),--build '$(OUT)') $(if $(WORKERS),--workers '$(WORKERS)') $(ARGS)
 
 demo: $(needs) ## Set up without compiling, predict a real laptop, make its twin, train briefly: 10 min after the set-up.
 	rm -rf build/demo

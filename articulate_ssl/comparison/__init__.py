@@ -1,0 +1,1 @@
+"""`make compare`: every method, ours among them, on the same clouds, by the same metrics, in one table."""

@@ -1,0 +1,179 @@
+"""What has to be run: the data of a category and view, and one job for every method or recipe and seed.
+
+A job is programs that leave notes (`pretrained/stages.py`): it can be killed at any time and done again elsewhere, and
+what is finished is not repeated. All lie in one folder that every machine sees, below `<build>/<category>-<view>`.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from articulate_ssl.baselines import METHODS
+from articulate_ssl.comparison.rows import needs_occupancy
+from articulate_ssl.metrics.report import JSON_NAME
+from articulate_ssl.pretrained.pack import PROFILES, VIEW_OF_DATA, fit_command, generate_arguments, newest_metrics
+from articulate_ssl.pretrained.rebuild import DEPTH_OPTIONS, resumed
+from articulate_ssl.pretrained.stages import Stage, Workplace
+from articulate_ssl.training.checkpoint import load_module
+from datamodules.manifest import MANIFEST_NAME, Manifest, set_folder
+
+DATA_SEED = 21  # no other: shipped weights and their check are of 11 and 12, README's numbers of 1 to 4
+OCCUPANCY_SAMPLES = 2048  # of each training cloud
+# Configuration files of recipes that need their own, behind the category's and the profile.
+RECIPE_CONFIGS = {"paper": (Path("configs/profiles/paper_recipe.yaml"),)}
+SAMPLES = 300  # test clouds; chosen: Oracle ICP takes two seconds for each
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is the same for all rows of a table.
+
+    Attributes:
+        category: Category name.
+        view: `complete` or `partial`.
+        build: Folder of everything that is trained.
+        root: Folder of the data set.
+        samples: Test clouds, spread over instances and states.
+        steps: Of each method, in the place of its own; recipes have those of their configuration.
+        configs: More configuration files for the recipes, behind the category's and the profile.
+        data_options: Words for the generator, if the set does not exist yet.
+    """
+
+    category: str
+    view: str
+    build: Path
+    root: Path
+    samples: int = SAMPLES
+    steps: int | None = None
+    configs: tuple[Path, ...] = ()
+    data_options: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Of the table's files."""
+        return f"{self.category}-{self.view}"
+
+    @property
+    def folder(self) -> Path:
+        """Of the jobs."""
+        return self.build / self.name
+
+    @property
+    def orientation_range(self) -> float:
+        """How far objects are turned, as the recipes' profile of this view says."""
+        degrees = 180.0
+        for file in PROFILES[VIEW_OF_DATA[self.view]]:
+            degrees = yaml.safe_load(Path(file).read_text())["model"].get("orientation_range", degrees)
+        return degrees
+
+
+def make_data(setting: Setting, learners: tuple[str, ...], say: Callable[[str], None]) -> None:
+    """Make the set, and the occupancy samples that some method needs, if they are not there.
+
+    Raises:
+        StageFailed: if the generator fails.
+    """
+    protocol = "honest" if setting.view == "partial" else None
+    folder = set_folder(setting.root, setting.category, "procedural", setting.view, protocol)
+    occupancy = needs_occupancy(learners)
+    if (folder / MANIFEST_NAME).is_file():
+        if not occupancy or (folder / "occupancy").is_dir():
+            return
+        words = generate_arguments(Manifest.load(folder))
+    else:
+        words = ["--category", setting.category, "--view", setting.view, "--seed", str(DATA_SEED)]
+        words += DEPTH_OPTIONS if setting.view == "partial" else ()
+        words += setting.data_options
+    words += ["--occupancy", str(OCCUPANCY_SAMPLES)] if occupancy else []
+    command = (sys.executable, "-m", "render.generate", *words, "--out", str(setting.root), "--workers", "1")
+    Workplace(f"{setting.name}: data", setting.folder / "data").run(Stage("data", command), say)
+
+
+@dataclass(frozen=True)
+class Job:
+    """The training and test of one method or recipe with one seed.
+
+    Attributes:
+        setting: Category, view and effort.
+        learner: Name of the method or recipe.
+        seed: Of the training.
+    """
+
+    setting: Setting
+    learner: str
+    seed: int
+
+    @property
+    def title(self) -> str:
+        """For people."""
+        return f"{self.setting.name}: {self.learner}, seed {self.seed}"
+
+    @property
+    def work(self) -> Workplace:
+        """Where its programs run."""
+        return Workplace(self.title, self.setting.folder / f"{self.learner}-{self.seed}")
+
+    def stages(self) -> tuple[Stage, ...]:
+        """The programs, in their order."""
+        return (self._method_stage(),) if self.learner in METHODS else self._recipe_stages()
+
+    def make(self, say: Callable[[str], None] = lambda _line: None) -> None:
+        """Do what is not done yet.
+
+        Raises:
+            StageFailed: if a program fails; what is finished stays.
+        """
+        again = False
+        for stage in self.stages():
+            if self.work.seconds(stage) is not None and not again:
+                continue
+            go_on = resumed(self._run, self.work.begun(stage)) if stage.name == "fit" else ()
+            self.work.run(stage, say, go_on)
+            again = True
+
+    @property
+    def finished(self) -> bool:
+        """Whether all of its programs have come to their end."""
+        return all(self.work.seconds(stage) is not None for stage in self.stages())
+
+    def report(self, column: str | None) -> dict[str, Any]:
+        """The content of `metrics.json`, of one column of a recipe's, with `parameters` and `train_seconds`."""
+        if column is None:
+            return json.loads((self.work.folder / JSON_NAME).read_text())
+        path = newest_metrics(self._run)
+        whole = json.loads(path.read_text())
+        fit, _ = self.stages()
+        module = load_module(whole["checkpoint"])
+        about = {"parameters": sum(p.numel() for p in module.parameters()), "train_seconds": self.work.seconds(fit)}
+        return {"part_names": whole["part_names"], **whole["columns"][column], **about}
+
+    @property
+    def _run(self) -> Path:
+        return self.work.folder / "run"
+
+    def _method_stage(self) -> Stage:
+        setting = self.setting
+        words = [self.learner, "--category", setting.category, "--view", setting.view, "--root", str(setting.root)]
+        words += ["--seed", str(self.seed), "--samples", str(setting.samples)]
+        words += ["--orientation-range", str(setting.orientation_range), "--out", str(self.work.folder)]
+        words += [] if setting.steps is None else ["--steps", str(setting.steps)]
+        return Stage("method", (sys.executable, "-m", "articulate_ssl.baselines", *words))
+
+    def _recipe_stages(self) -> tuple[Stage, ...]:
+        setting = self.setting
+        _, fit, *learn = fit_command(setting.category, VIEW_OF_DATA[setting.view], self.seed)
+        configs = (*RECIPE_CONFIGS.get(self.learner, ()), *setting.configs)
+        learn += [word for file in configs for word in ("-c", str(file))]
+        learn += ["--model.recipe", self.learner, "--data.root", str(setting.root), "--data.seed", str(self.seed)]
+        learn += ["--data.max_test_samples", str(setting.samples), "--trainer.enable_progress_bar", "false"]
+        learn += ["--trainer.default_root_dir", str(self._run)]
+        ours = (sys.executable, "-m", "articulate_ssl.cli")
+        columns = ("--model.inference.columns", "true")
+        return Stage("fit", (*ours, fit, *learn)), Stage("test", (*ours, "test", *learn, *columns))
