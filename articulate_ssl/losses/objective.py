@@ -11,9 +11,12 @@ from torch.nn import functional
 
 from articulate_ssl.losses.joint_regularization import joint_regularization
 from articulate_ssl.losses.reconstruction import (
+    balanced_association,
     distances_to_cloud,
     distances_to_parts,
+    owned_parts,
     part_by_part,
+    part_of_mass,
     posterior_association,
     whole_shape,
 )
@@ -21,6 +24,8 @@ from articulate_ssl.network.category_object import CanonicalObject
 from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.network.rigid_alignment import RigidHypotheses
 from articulate_ssl.ops.chamfer import chamfer, hypothesis_distances, nearest_index
+
+SLOTS, POSTERIOR = "slots", "posterior"
 
 
 @dataclass(frozen=True)
@@ -35,7 +40,17 @@ class ObjectiveOptions:
         deviation: Weight of the squared distance between an instance's canonical object and joint lines and the
             category's (staged recipe). Without it they drift together with the poses.
         segmentation: Weight of the cross-entropy between part proposal and posterior association (staged recipe).
-        posterior_scale: Standard deviation of the posterior association, in normalised units (staged recipe).
+        posterior_scale: Standard deviation of the posterior association, in normalised units.
+        association: What weights the parts of a point: `slots`, the slot attention's answer, as in the paper, or
+            `posterior`, the posed parts that explain it, which the slots are then taught (paper recipe). Slots that
+            weight their own reconstruction collapse within ten steps.
+        agreement: Weight, in choosing among hypotheses, of the distance of points to the parts that the slot attention
+            assigns, beside the whole shape's (paper recipe; the original code chooses by such distances alone).
+            Without it two parts of one shape are told apart by chance, in every cloud anew.
+        part_mass: Divide a part's distance by its own share of the points, so that a small part counts as much as a
+            large one (paper recipe; the original code does).
+        detached_shapes: L_reg moves joint lines to shapes, not shapes to joint lines (paper recipe; the original code
+            does).
     """
 
     unidirectional: bool = False
@@ -45,6 +60,15 @@ class ObjectiveOptions:
     deviation: float = 10.0
     segmentation: float = 0.1
     posterior_scale: float = 0.03
+    association: str = POSTERIOR
+    agreement: float = 1.0
+    part_mass: bool = True
+    detached_shapes: bool = True
+
+    def __post_init__(self) -> None:
+        """Raises: ValueError for an unknown association."""
+        if self.association not in (SLOTS, POSTERIOR):
+            raise ValueError(f"objective.association must be {SLOTS!r} or {POSTERIOR!r}, got {self.association!r}")
 
 
 class Terms(NamedTuple):
@@ -87,24 +111,34 @@ def spread_to_points(logits: Tensor, points: Tensor) -> Tensor:
     return logits.gather(1, index[..., None].expand(-1, -1, logits.shape[2]))
 
 
-def paper_terms(winner: Hypotheses, points: Tensor, options: ObjectiveOptions) -> Terms:
+def paper_terms(winner: Hypotheses, points: Tensor, options: ObjectiveOptions, balance: float = 0.0) -> Terms:
     """The paper's objective for the winning hypothesis: whole-shape and part-by-part reconstruction, and L_reg.
 
-    Parts are weighted by the slot attention's association, which also pools the features that everything is predicted
-    from: it receives gradients by both ways.
+    Parts that no point belongs to are left out of the part-by-part term: compared with the whole cloud they would
+    decode all of it.
+
+    Args:
+        balance: How far the posterior association is drawn to parts of equal shares (`balanced_association`).
     """
     posed = winner.posed()[:, 0]
-    association = spread_to_points(winner.association_logits, points).softmax(dim=-1)
     to_part = distances_to_parts(points, posed)
+    if options.association == SLOTS:
+        association = spread_to_points(winner.association_logits, points).softmax(dim=-1)
+        segmentation = points.new_zeros(())
+    else:
+        association = balanced_association(to_part, options.posterior_scale, balance)
+        segmentation = _proposal_term(winner.association_logits, association)
     bidirectional = not options.unidirectional
     whole = whole_shape(to_part, distances_to_cloud(posed, points) if bidirectional else None)
     labels = association.argmax(dim=-1)
-    parts = part_by_part(to_part, distances_to_cloud(posed, points, labels) if bidirectional else None, association)
+    to_cloud = distances_to_cloud(posed, points, labels) if bidirectional else None
+    seen = owned_parts(labels, posed.shape[1])
+    parts = (part_of_mass if options.part_mass else part_by_part)(to_part, to_cloud, association, seen)
     reconstruction = (whole + parts).mean()
-    joints = _joint_term(winner, options)
-    loss = reconstruction + options.joint_regularization * joints
+    joints = _joint_term(winner, options, options.detached_shapes)
+    loss = reconstruction + options.joint_regularization * joints + options.segmentation * segmentation
     zero = loss.new_zeros(())
-    return Terms(loss, reconstruction, joints, zero, zero, zero, association)
+    return Terms(loss, reconstruction, joints, zero, zero, segmentation, association)
 
 
 def staged_terms(
@@ -175,17 +209,17 @@ def _deviation_term(selected: Hypotheses, category: CanonicalObject) -> Tensor:
     )
 
 
-def _joint_term(winner: Hypotheses, options: ObjectiveOptions) -> Tensor:
-    """L_reg of the first hypothesis."""
+def _joint_term(winner: Hypotheses, options: ObjectiveOptions, detached: bool = False) -> Tensor:
+    """L_reg of the first hypothesis; `detached` shapes receive no gradient."""
     structure = winner.structure
     if options.joint_regularization == 0:
         return structure.pivot.new_zeros(())
-    canonical = winner.object_shape()
+    canonical = winner.object_shape().detach() if detached else winner.object_shape()
     motion = winner.articulation()[:, 0]
     articulated = torch.einsum("bkij,bkmj->bkmi", motion[..., :3, :3], canonical) + motion[..., None, :3, 3]
     return joint_regularization(
         canonical,
-        articulated,
+        articulated.detach() if detached else articulated,
         structure.pair_pivot,
         structure.pair_axis[:, 0],
         structure.confidence,

@@ -12,6 +12,7 @@ from torch import Tensor
 from articulate_ssl.ops.chamfer import nearest_index
 
 _TINY = 1e-8
+_SINKHORN_ROUNDS = 5  # chosen without a measurement
 
 
 def distances_to_parts(
@@ -48,14 +49,55 @@ def posterior_association(
     return (to_part.detach().square() / (-2 * scale**2)).softmax(dim=-1)
 
 
+def balanced_association(
+    to_part: Tensor,  # [B, N, K]
+    scale: float,
+    balance: float,
+) -> Tensor:  # [B, N, K]
+    """The posterior association with parts drawn to equal shares of each cloud, by Sinkhorn's rounds; no gradient.
+
+    Args:
+        scale: See `posterior_association`.
+        balance: How far they are drawn, from 0 (the posterior) to 1 (equal shares, up to what the rounds leave).
+    """
+    logits = to_part.detach().square() / (-2 * scale**2)
+    for _ in range(_SINKHORN_ROUNDS):
+        logits = logits - balance * logits.logsumexp(dim=1, keepdim=True)
+        logits = logits - logits.logsumexp(dim=2, keepdim=True)
+    return logits.exp()
+
+
+def owned_parts(
+    labels: Tensor,  # [B, N]
+    num_parts: int,
+) -> Tensor:  # [B, K] bool
+    """Whether any point belongs to a part."""
+    return (labels[:, :, None] == torch.arange(num_parts, device=labels.device)).any(dim=1)
+
+
 def part_by_part(
     to_part: Tensor,  # [B, N, K]
     to_cloud: Tensor | None,  # [B, K, M], None for the unidirectional distance
     association: Tensor,  # [B, N, K], rows sum to one
+    owned: Tensor | None = None,  # [B, K] bool, of which parts the way back counts; None counts all
 ) -> Tensor:  # [B]
     """Association-weighted distance of the input to the parts, plus that of the parts to the input."""
     loss = (association * to_part).sum(dim=-1).mean(dim=-1)
-    return loss if to_cloud is None else loss + to_cloud.mean(dim=(-1, -2))
+    if to_cloud is None:
+        return loss
+    return loss + (to_cloud.mean(dim=(-1, -2)) if owned is None else _mean_of(to_cloud.mean(dim=-1), owned))
+
+
+def part_of_mass(
+    to_part: Tensor,  # [B, N, K]
+    to_cloud: Tensor | None,  # [B, K, M], None for the unidirectional distance
+    association: Tensor,  # [B, N, K], rows sum to one
+    owned: Tensor,  # [B, K] bool
+) -> Tensor:  # [B]
+    """The mean over the owned parts of each one's distance: of its own points to it, plus of it to its own points."""
+    mass = association.sum(dim=1).clamp_min(_TINY)
+    distance = (association * to_part).sum(dim=1) / mass
+    return _mean_of(distance if to_cloud is None else distance + to_cloud.mean(dim=-1), owned)
 
 
 def whole_shape(
@@ -65,6 +107,11 @@ def whole_shape(
     """d(X, Y): Chamfer distance between the input and the union of the posed parts."""
     loss = to_part.amin(dim=-1).mean(dim=-1)
     return loss if to_cloud is None else loss + to_cloud.mean(dim=(-1, -2))
+
+
+def _mean_of(value: Tensor, counted: Tensor) -> Tensor:
+    """Mean over those of the last dimension that count, [B, K] -> [B]."""
+    return (value * counted).sum(dim=-1) / counted.sum(dim=-1).clamp_min(1)
 
 
 def _gap(query: Tensor, target: Tensor, index: Tensor) -> Tensor:

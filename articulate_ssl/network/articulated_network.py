@@ -17,7 +17,7 @@ from articulate_ssl.geometry.se3 import invert_se3
 from articulate_ssl.network.backbone import EquivariantBackbone
 from articulate_ssl.network.category_object import CategoryObject
 from articulate_ssl.network.heads.pose import PoseHead
-from articulate_ssl.network.heads.shape import ShapeHead
+from articulate_ssl.network.heads.shape import CanonicalShape, ShapeHead
 from articulate_ssl.network.heads.structure import AxisHead, PairHead, Structure
 from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.network.options import NetworkOptions
@@ -67,7 +67,10 @@ class ArticulatedNetwork(nn.Module):
         estimate: Hypotheses | None = None,  # the previous iteration's winner (H = 1)
         labels: Tensor | None = None,  # [B, N] parts by that estimate
     ) -> Hypotheses:
-        """Hypotheses for every group element; with an estimate, the residual to it (iterated pose estimation)."""
+        """Hypotheses for every group element and start of the joint states.
+
+        With an estimate they are residuals to it (iterated pose estimation).
+        """
         if estimate is not None:
             pose = invert_se3(estimate.object_pose()[:, 0].detach())
             pose = pose[torch.arange(len(points), device=points.device)[:, None], labels]
@@ -79,11 +82,34 @@ class ArticulatedNetwork(nn.Module):
         chain = self.category.chain()
         shape = self.shape_head(invariant, self.category)
         structure = self._structure(equivariant, invariant, chain)
-        base, state = self.pose_head(equivariant, chain, mean)
+        base, state = self.pose_head(equivariant, chain, mean, residual=estimate is not None)
+        structure = structure.repeated(len(self.pose_head.anchors))
         if estimate is not None:
             state = estimate.state.detach() + state
             base = estimate.base.detach() @ base
         return Hypotheses(shape, structure, base, state, logits)
+
+    def category_at(
+        self,
+        base: Tensor,  # [B, H, 4, 4]
+        state: Tensor,  # [B, H, J]
+    ) -> Hypotheses:
+        """The category's own shape and joints at poses: hypotheses that nothing was read from a cloud for."""
+        category, chain, (clouds, count) = self.category, self.category.chain(), base.shape[:2]
+        canonical, pair = category.canonical(), pair_of_joints(chain, category.pairs)
+        pair_axis = canonical.axis.expand(clouds, count, -1, -1)
+        pair_pivot = canonical.pivot.expand(clouds, -1, -1)
+        shape = CanonicalShape(category.template.expand(clouds, -1, -1, -1), category.assembly.expand(clouds, -1, -1))
+        structure = Structure(
+            category.confidence.expand(clouds, -1),
+            pair_pivot,
+            pair_axis,
+            pair_pivot[:, pair],
+            pair_axis[:, :, pair],
+            chain,
+            self.joint_type,
+        )
+        return Hypotheses(shape, structure, base, state, base.new_zeros(clouds, 0, self.num_parts))
 
     def _part_features(self, points: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
         """Part proposal [B, C, K], and features [B, K, G, 2D] of the parts beside those of the whole."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -12,10 +13,13 @@ from torch.nn import functional
 from articulate_ssl.geometry.kinematic_chain import KinematicChain, extract_chain, pair_index
 from articulate_ssl.ops.farthest_point import farthest_point_order
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
-from articulate_ssl.shape.joints import pair_of_joints
+from articulate_ssl.shape.joints import Joints, pair_of_joints
 from articulate_ssl.shape.stretch import principal_directions
 
 _START_SIZE = 0.2  # standard deviation of a part's points before anything is learnt; objects have diagonal 1
+# Parts that start apart: distance of each from the middle, and standard deviations of its points away from the joint,
+# across the plane of the part, and along the axis. A hinge with flaps; chosen, and the first try worked.
+_START_APART, _START_FLAP = 0.12, (0.1, 0.05, 0.18)
 # Adjacency confidence of a joint that discovery found, beside 0 of all other pairs: seven to one in a spanning tree.
 _FOUND = 2.0
 
@@ -67,6 +71,32 @@ class CategoryObject(nn.Module):
     def chain(self) -> KinematicChain:
         """The category's kinematic chain, from the running mean of the predicted adjacency confidences."""
         return extract_chain(self.mean_confidence, self.num_parts)
+
+    @torch.no_grad()
+    def articulated_shape(self, joint_type: int) -> ArticulatedShape:
+        """The category's own shape with the joints of its chain; what `adopt` took over comes back, but thinned."""
+        canonical, chain = self.canonical(), self.chain()
+        label = torch.arange(self.num_parts, device=self.template.device).repeat_interleave(self.template.shape[1])
+        pair = pair_of_joints(chain, self.pairs)
+        return ArticulatedShape(
+            canonical.shape.flatten(0, 1), label, Joints(chain, canonical.axis[pair], canonical.pivot[pair], joint_type)
+        )
+
+    @torch.no_grad()
+    def start_apart(self) -> None:
+        """Let parts start as flaps around the z axis, joints between them along it.
+
+        Parts that start in one place stay there: no joint state moves one against another, and each becomes the whole
+        object. Which part is which, and where the axis is, is free, because poses are.
+        """
+        scale = self.template.new_tensor(_START_FLAP) / _START_SIZE
+        self.template.mul_(scale)
+        turn = math.pi * (1 + 2 * torch.arange(self.num_parts, device=scale.device) / self.num_parts)
+        place = torch.stack([turn.cos(), turn.sin(), torch.zeros_like(turn)], dim=-1)
+        self.assembly.copy_(_START_APART * place)
+        self.pivot.copy_(self.assembly[self.pairs].mean(dim=1))
+        upward = functional.normalize(0.1 * self.axis + self.axis.new_tensor([0.0, 0.0, 1.0]), dim=-1)
+        self.axis.copy_(upward)
 
     @torch.no_grad()
     def follow(self, confidence: Tensor, weight: float) -> None:

@@ -16,7 +16,7 @@ from articulate_ssl.shape.joints import Joints
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """Of every cloud one shape and structure, and H poses: h runs over the group, or over those that were selected.
+    """Of every cloud one shape and structure, and H poses: of the group and all starts of the states, or a selection.
 
     Attributes:
         shape: Canonical part shapes and their assembly.
@@ -69,10 +69,11 @@ class Hypotheses:
         """Canonical object space -> camera space of every part, [B, H, K, 4, 4]."""
         return self.structure.joints().part_pose(self.base, self.state)
 
-    def posed(self) -> Tensor:
-        """Reconstructions Y_i^g, [B, H, K, M, 3]."""
-        pose = self.object_pose()
-        return torch.einsum("bhkij,bkmj->bhkmi", pose[..., :3, :3], self.object_shape()) + pose[..., None, :3, 3]
+    def posed(self, every: int = 1) -> Tensor:
+        """Reconstructions Y_i^g, [B, H, K, M, 3]; of a part's points one in `every`."""
+        pose, shape = self.object_pose(), self.object_shape()
+        shape = shape if every == 1 else shape[:, :, ::every]
+        return torch.einsum("bhkij,bkmj->bhkmi", pose[..., :3, :3], shape) + pose[..., None, :3, 3]
 
     def select(self, index: Tensor) -> Hypotheses:
         """Keep hypotheses `index` [B, H'] of every cloud, or one, [B]."""

@@ -28,6 +28,10 @@ class NetworkOptions:
         pose_aware: False leaves every iteration at identity poses (the paper's ablation of pose-aware convolution).
         part_features: False predicts part properties from whole-shape features (the paper's ablation "without parts").
         shared_axis: One axis direction for all joints of an object, as the paper assumes.
+        state_anchors: Joint states that hypotheses start from, beside rotations: the middles of so many equal stretches
+            of the articulation range, for several joints in every combination. 1 is the middle of the range, as in the
+            original code; 0 lets all start at zero, where an axis and its pivot have no gradient; null leaves it to the
+            recipe (0 staged; paper: as many as make at most `recipes.paper.STATE_COMBINATIONS` combinations).
     """
 
     group_order: int = 60
@@ -47,3 +51,4 @@ class NetworkOptions:
     pose_aware: bool = True
     part_features: bool = True
     shared_axis: bool = True
+    state_anchors: int | None = None

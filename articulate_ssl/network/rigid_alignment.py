@@ -36,9 +36,10 @@ class RigidHypotheses(NamedTuple):
 class RigidAlignment(nn.Module):
     """Whole-shape EPN auto-encoder: an invariant canonical shape, and one residual pose per group element."""
 
-    def __init__(self, options: NetworkOptions, num_points: int) -> None:
-        """Args: sizes; points of the canonical shape."""
+    def __init__(self, options: NetworkOptions, num_points: int, flow_bound: float = _FLOW_BOUND) -> None:
+        """Args: sizes; points of the canonical shape; how far an instance moves them at most."""
         super().__init__()
+        self.flow_bound = flow_bound
         group, dim = rotation_group(options.group_order), options.head_dim
         self.register_buffer("elements", group.elements, persistent=False)
         self.backbone = EquivariantBackbone.of(options)
@@ -67,4 +68,4 @@ class RigidAlignment(nn.Module):
         elements = self.elements.to(residual)
         rotation = elements @ roma.rotvec_to_rotmat(residual[..., :3])
         translation = torch.einsum("gij,bgj->bgi", elements, residual[..., 3:]) + mean
-        return RigidHypotheses(rotation, translation, self.template + _FLOW_BOUND * flow.tanh())
+        return RigidHypotheses(rotation, translation, self.template + self.flow_bound * flow.tanh())

@@ -17,6 +17,13 @@ class ScheduleOptions:
         decay: The learning rate is multiplied by this every `decay_every` steps (paper recipe).
         decay_every: See above.
         final_rate: Share of the learning rate that is left at the end of its cosine (staged recipe).
+        balanced_share: Share of the articulated network's steps in which the clouds of a batch are spread evenly over
+            the joint states that estimation starts from (paper recipe).
+        equal_parts_share: Share of these steps in which parts are drawn to equal shares of every cloud, less and less
+            (paper recipe, posterior association).
+        agreement_share: Share of these steps before slots have a say in which hypothesis is chosen (paper recipe).
+        shared_share: Share of these steps in which all instances have the category's shape; halfway from there to the
+            end they have their own (paper recipe).
         category_rate: Learning rate of category-level shapes and joints relative to the networks' (staged recipe).
     """
 
@@ -27,4 +34,8 @@ class ScheduleOptions:
     decay: float = 0.7
     decay_every: int = 1000
     final_rate: float = 0.02
+    balanced_share: float = 0.5
+    equal_parts_share: float = 0.3
+    agreement_share: float = 0.4
+    shared_share: float = 0.5
     category_rate: float = 0.1

@@ -30,11 +30,16 @@ class CanonicalShape(NamedTuple):
 
 
 class ShapeHead(nn.Module):
-    """The category's shapes, stretched along their principal axes, displaced point by point, and shifted."""
+    """The category's shapes, stretched along their principal axes, displaced point by point, and shifted.
+
+    Attributes:
+        freedom: Share of all that, in [0, 1], which recipes may raise in the course of training.
+    """
 
     def __init__(self, num_parts: int, options: NetworkOptions) -> None:
         """Args: K; bounds of stretch and flow, points of a shape, channels."""
         super().__init__()
+        self.freedom = 1.0
         self.stretch_bound, self.flow_bound = options.stretch_bound, options.flow_bound
         dim, outputs = options.head_dim, 6 + 3 * options.shape_points
         self.perceptron = nn.ModuleList(perceptron(2 * dim, dim, outputs) for _ in range(num_parts))
@@ -47,6 +52,8 @@ class ShapeHead(nn.Module):
         """Shapes of the instances."""
         out = torch.stack([head(invariant[:, k]) for k, head in enumerate(self.perceptron)], dim=1)
         shift, stretch, flow = out.split([3, 3, out.shape[-1] - 6], dim=-1)
+        if self.freedom < 1:
+            shift, stretch, flow = (self.freedom * value for value in (shift, stretch, flow))
         stretch = stretch_matrices(category.principal_axes, self.stretch_bound * stretch.tanh())
         shape = torch.einsum("bkij,kmj->bkmi", stretch, category.template)
         shape = shape + self.flow_bound * flow.unflatten(-1, (-1, 3)).tanh()

@@ -41,6 +41,13 @@ class Structure:
         """Of each cloud the hypotheses [rows, index]."""
         return replace(self, axis=self.axis[rows, index], pair_axis=self.pair_axis[rows, index])
 
+    def repeated(self, count: int) -> Structure:
+        """Every hypothesis `count` times, side by side."""
+        if count == 1:
+            return self
+        axis, pair_axis = (value.repeat_interleave(count, dim=1) for value in (self.axis, self.pair_axis))
+        return replace(self, axis=axis, pair_axis=pair_axis)
+
     def joints(self) -> Joints:
         """The chain's joints [B, H, J]."""
         return Joints(self.chain, self.axis, self.pivot[:, None], self.joint_type)

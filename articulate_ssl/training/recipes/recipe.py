@@ -55,8 +55,14 @@ class Recipe(ABC):
         self.estimator, self.objective = estimator, objective
         self.schedule, self.discovery = schedule, discovery
 
+    refines = True  # by registration at test time, where the options leave it to the recipe
     learns_tree = True  # or it was found before, and stays
     cheap_steps = 0  # so many at the start are of another kind, which takes less time than the steps to come
+
+    @staticmethod
+    def state_anchors(num_parts: int) -> int:
+        """`NetworkOptions.state_anchors` where the options leave it to the recipe."""
+        return 0
 
     @property
     def ready(self) -> bool:

@@ -4,9 +4,12 @@ import pytest
 import torch
 
 from articulate_ssl.losses.reconstruction import (
+    balanced_association,
     distances_to_cloud,
     distances_to_parts,
+    owned_parts,
     part_by_part,
+    part_of_mass,
     posterior_association,
     whole_shape,
 )
@@ -112,3 +115,37 @@ def test_losses_are_sums_of_mean_distances():
     torch.testing.assert_close(part_by_part(to_part, to_cloud, certain), own + to_cloud.mean(dim=(1, 2)))
     exact = part_by_part(to_part, None, posterior_association(to_part, 1e-4))
     torch.testing.assert_close(exact, whole_shape(to_part, None), rtol=1e-4, atol=1e-5)
+
+
+def test_a_balanced_association_draws_parts_to_equal_shares():
+    near, far = torch.full((40, 1), 0.02), torch.full((40, 1), 0.05)
+    near[:10] = 0.06  # by distance alone a quarter of the points is the second part's
+    to_part = torch.cat([near, far], dim=1)[None]
+    shares = [balanced_association(to_part, 0.02, balance).mean(dim=1)[0, 1] for balance in (0.0, 0.5, 1.0)]
+    assert shares[0] < 0.3 and shares[0] < shares[1] < shares[2]
+    assert shares[2] == pytest.approx(0.5, abs=0.02)
+    torch.testing.assert_close(balanced_association(to_part, 0.02, 0.0), posterior_association(to_part, 0.02))
+    assert balanced_association(to_part, 0.02, 1.0).sum(dim=-1).sub(1).abs().max() < 1e-5
+
+
+def test_parts_without_points_do_not_count():
+    points, posed, _ = _clouds()
+    labels = torch.zeros(2, 40, dtype=torch.long)
+    labels[:, 20:] = 1  # the third part owns nothing
+    owned = owned_parts(labels, 3)
+    assert owned.tolist() == [[True, True, False]] * 2
+    association = torch.nn.functional.one_hot(labels, 3).double()
+    to_part, to_cloud = distances_to_parts(points, posed), distances_to_cloud(posed, points, labels)
+    for loss in (part_of_mass, part_by_part):
+        (gradient,) = torch.autograd.grad(loss(to_part, to_cloud, association, owned).sum(), posed, retain_graph=True)
+        assert gradient[:, 2].abs().max() == 0 and (gradient[:, :2].abs().amax(dim=(-1, -2)) > 0).all()
+
+
+def test_a_part_counts_by_its_own_points():
+    """A part of few points as much as one of many."""
+    to_part = torch.tensor([[[0.1, 9.0]] * 30 + [[9.0, 0.3]] * 2])
+    association = torch.tensor([[[1.0, 0.0]] * 30 + [[0.0, 1.0]] * 2])
+    owned = torch.ones(1, 2, dtype=torch.bool)
+    assert part_of_mass(to_part, None, association, owned).item() == pytest.approx(0.2)
+    back = torch.tensor([[[0.5] * 4, [0.1] * 4]])
+    assert part_of_mass(to_part, back, association, owned).item() == pytest.approx(0.5)

@@ -195,10 +195,10 @@ def test_a_checkpoint_that_does_not_fit_is_refused(trained, tmp_path):
 @pytest.mark.parametrize(
     ("options", "stop", "steps"),
     [
-        ({"warmup_steps": 95, "network": {"iterations": 1}}, 50, 100),  # on clouds registered before the stop
+        ({"warmup_steps": 38, "network": {"iterations": 1}}, 20, 40),  # on clouds registered before the stop
         ({"warmup_steps": 2}, 4, 7),  # in self-supervision, within a pass over the data
         ({"rigid_steps": 3, "warmup_steps": 1}, 2, 6),  # in stage 0, before discovery
-        ({"recipe": "paper", "network": {"iterations": 1}}, 50, 100),
+        ({"recipe": "paper", "network": {"iterations": 1}}, 20, 40),
     ],
     ids=str,
 )
@@ -246,8 +246,9 @@ def test_every_stage_trains_every_parameter_it_reads(root, case):
         assert all(p.grad is None or p.grad.isfinite().all() for p in module.parameters())
 
     module.on_before_optimizer_step = note
-    fit(module, root, 3)
-    assert len(losses) == 3 and np.isfinite(losses).all()
+    steps = 5 if case.get("recipe") == "paper" else 3  # of six: instances have their own shape after half of them
+    fit(module, root, steps)
+    assert len(losses) == steps and np.isfinite(losses).all()
     silent = {
         n
         for n in silent
@@ -283,8 +284,7 @@ def test_predictions_see_points_only(root):
 
 def test_predicting_a_scan_of_any_unit_and_origin(trained):
     cloud = _clouds(1)[0].double().numpy()
-    near = trained[0].predict_cloud(cloud)
-    far = trained[0].predict_cloud(1000 * cloud + [5e3, 0, -2e3])
+    near, far = trained[0].predict_clouds([cloud, 1000 * cloud + [5e3, 0, -2e3]])
     count = trained[0].inference.points  # a scan of fewer points repeats them
     assert near.points.shape == (count, 3) and near.prediction.part_id.shape == (1, count)
     np.testing.assert_allclose(far.center, 1000 * near.center + [5e3, 0, -2e3])

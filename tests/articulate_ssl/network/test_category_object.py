@@ -1,0 +1,71 @@
+"""Where a category's parts start."""
+
+import pytest
+import torch
+
+from articulate_ssl.geometry.rotation_group import rotation_group
+from articulate_ssl.geometry.screw import REVOLUTE
+from articulate_ssl.network.articulated_network import ArticulatedNetwork
+from articulate_ssl.network.category_object import CategoryObject
+from articulate_ssl.network.heads.pose import PoseHead, state_anchors
+from articulate_ssl.network.options import NetworkOptions
+
+
+@pytest.mark.parametrize("parts", [2, 3, 4])
+def test_parts_that_start_apart_move_one_against_another(parts):
+    category = CategoryObject(parts, 64)
+    category.start_apart()
+    centers = category.canonical().shape.mean(dim=1)
+    assert torch.pdist(centers).min() > 0.08  # of the object's diagonal; the mean of 64 points is within .03 of theirs
+    assert (category.axis[:, 2] > 0.8).all()
+    between = category.assembly[category.pairs].mean(dim=1)
+    torch.testing.assert_close(category.pivot.detach(), between.detach())
+
+
+def test_joint_states_start_in_the_middles_of_equal_stretches():
+    assert state_anchors(0, 2, 1.6).tolist() == [[0.0, 0.0]]
+    torch.testing.assert_close(state_anchors(1, 1, 1.6), torch.tensor([[0.8]]))
+    torch.testing.assert_close(state_anchors(2, 1, 1.6), torch.tensor([[0.4], [1.2]]))
+    torch.testing.assert_close(state_anchors(2, 2, 1.6), torch.tensor([[0.4, 0.4], [0.4, 1.2], [1.2, 0.4], [1.2, 1.2]]))
+
+
+def test_every_rotation_is_tried_with_every_start():
+    options = NetworkOptions(group_order=12, head_dim=4, state_anchors=2)
+    head = PoseHead(2, rotation_group(12), 1.6, options)
+    network = ArticulatedNetwork(_small(state_anchors=2), 2, REVOLUTE, state_bound=1.6)
+    out = network(torch.rand(2, 32, 3))
+    assert out.base.shape == (2, 24, 4, 4) and out.axis.shape == (2, 24, 1, 3)
+    torch.testing.assert_close(out.state[0, :4, 0], torch.tensor([0.4, 1.2, 0.4, 1.2]), atol=0.02, rtol=0)
+    # Starts of one group element share its rotation until the heads have learnt something.
+    torch.testing.assert_close(out.base[:, 0::2, :3, :3], out.base[:, 1::2, :3, :3], atol=0.05, rtol=0)
+    residual = head.joint_state(torch.zeros(1, 2, 12, 8), network.category.chain(), residual=True)
+    assert residual.abs().max() < 0.02
+
+
+def _small(**options) -> NetworkOptions:
+    sizes = {"group_order": 12, "dims": [4, 4, 8], "radii": [0.2, 0.3, 0.4], "num_neighbors": 8}
+    return NetworkOptions(**sizes, num_kernel_points=13, head_dim=8, shape_points=16, **options)
+
+
+def test_instances_have_the_categorys_shape_until_they_are_freed():
+    network = ArticulatedNetwork(_small(), 2)
+    for head in network.shape_head.perceptron:
+        torch.nn.init.normal_(head[-1].weight)
+    cloud = torch.rand(2, 32, 3)
+    common = network.category.canonical().shape
+    assert (network(cloud).object_shape() - common).abs().max() > 0.01
+    network.shape_head.freedom = 0.0
+    torch.testing.assert_close(network(cloud).object_shape(), common.expand(2, -1, -1, -1))
+
+
+@pytest.mark.parametrize(("count", "stretch"), [(1, 1.6), (4, 0.4)])
+def test_a_start_reaches_to_the_middle_of_its_neighbours_stretch(count, stretch):
+    """However strongly the head pulls."""
+    head = PoseHead(2, rotation_group(12), 1.6, NetworkOptions(head_dim=4, state_anchors=count))
+    chain = CategoryObject(2, 8).chain()
+    for one in head.state:
+        torch.nn.init.normal_(one[-1].weight, std=100.0)
+    state = head.joint_state(torch.randn(3, 2, 12, 8), chain).unflatten(1, (12, count))[..., 0]
+    away = state - state_anchors(count, 1, 1.6)[:, 0]
+    assert away.abs().amax() <= stretch + 1e-6
+    assert away.amax() > 0.9 * stretch and away.amin() < -0.9 * stretch
