@@ -56,7 +56,20 @@ def test_data_passes_every_option() -> None:
         assert option in text
 
 
-@pytest.mark.parametrize("target", ["data", "preview"])
+def test_compare_passes_every_option() -> None:
+    assert "--build" not in commands("compare", "CAT=laptop")
+    text = commands(
+        "compare", "CAT=all", "VIEW=partial", "SEEDS=3", "METHODS=npcs_epn staged", "ROOT=/sets", "OUT=/tables",
+        "WORKERS=2", "ARGS=--samples 20",
+    )  # fmt: skip
+    for option in (
+        "--categories all", "--view 'partial'", "--seeds '3'", "--methods npcs_epn staged", "--root '/sets'",
+        "--build '/tables'", "--workers '2'", "--samples 20",
+    ):  # fmt: skip
+        assert option in text
+
+
+@pytest.mark.parametrize("target", ["data", "preview", "compare"])
 def test_category_is_demanded_before_anything_runs(target: str) -> None:
     done = make(target)
     assert done.returncode == 2

@@ -21,6 +21,7 @@ from articulate_ssl.inference.checkpoint_file import CheckpointError
 from articulate_ssl.inference.export.folder import EXPORTERS_BY_NAME, ON_REQUEST, ExportError, exporters_named
 from articulate_ssl.inference.export.physics_check import PhysicsCheckError
 from articulate_ssl.inference.scan_prediction import ScanPrediction
+from articulate_ssl.ops.progress import shown
 from articulate_ssl.training.shipped_weights import shipped_weights
 from articulate_ssl.training.weights_card import VIEWS, WeightsCard
 from datamodules.point_cloud_io import PointCloudError, load_point_cloud
@@ -127,7 +128,8 @@ def _predict(args: argparse.Namespace) -> tuple[list[ScanPrediction], Articulate
 
 
 def _write(result: ScanPrediction, out: Path, args: argparse.Namespace) -> list[Path]:
-    files = result.export(out, args.formats)
+    with shown():
+        files = result.export(out, args.formats)
     if args.html:
         from articulate_ssl.inference.viewer import html_page
 

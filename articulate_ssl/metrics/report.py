@@ -57,8 +57,8 @@ def as_table(metrics: dict) -> Table:
     for name, of, value in rows(metrics):
         if previous is not None and name != previous:
             table.add_section()
-        interval = "-" if value["ci95"] is None else " … ".join(_cell(name, v) for v in value["ci95"])
-        cells = [_cell(name, value["mean"]), _cell(name, value["median"]), interval]
+        interval = "-" if value["ci95"] is None else " … ".join(cell(name, v) for v in value["ci95"])
+        cells = [cell(name, value["mean"]), cell(name, value["median"]), interval]
         table.add_row(name if name != previous else "", of, *cells)
         previous = name
     return table
@@ -109,7 +109,8 @@ def write_report(
     return content
 
 
-def _cell(name: str, value: float | None) -> str:
+def cell(name: str, value: float | None) -> str:
+    """A value of a quantity as tables show it."""
     if value is None:
         return "-"
     if name in PERCENT:

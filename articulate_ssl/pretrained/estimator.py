@@ -52,12 +52,12 @@ class ScanModule(Protocol):
     state_range: Tensor
     orientation: OrientationRange
 
-    def predict_cloud(
+    def predict_clouds(
         self,
-        points: np.ndarray,  # [N, 3] any unit and origin
+        clouds: Sequence[np.ndarray],  # each [N, 3], any unit and origin
         refine: bool | None,
-    ) -> ScanEstimate:
-        """What is predicted for one scan."""
+    ) -> list[ScanEstimate]:
+        """What is predicted for each of several scans."""
 
     def to(self, device: torch.device) -> Self:
         """Move to a device."""
@@ -76,7 +76,6 @@ class Estimator(ABC):
     device: torch.device
     estimators: tuple[ArticulatedPoseEstimator, ...]
 
-    @abstractmethod
     def predict(self, points: Cloud, refine: bool | None = None) -> ScanPrediction:
         """Parts, poses and joints of the object in one scan, in the frame and the units of the scan.
 
@@ -90,14 +89,23 @@ class Estimator(ABC):
             PointCloudError: if the cloud is missing, damaged or unusable.
             CheckpointError: if the weights predict NaN.
         """
+        return self.predict_batch([points], refine)[0]
+
+    @abstractmethod
+    def predict_batch(self, clouds: Iterable[Cloud], refine: bool | None = None) -> list[ScanPrediction]:
+        """`predict` of many clouds at once, faster than one by one, in their order.
+
+        Clouds may differ in size and unit, and none changes another's prediction. All are read before the first is
+        predicted.
+
+        Raises:
+            PointCloudError: if a cloud is missing, damaged or unusable.
+            CheckpointError: if the weights predict NaN.
+        """
 
     @abstractmethod
     def to(self, device: str | torch.device) -> Self:
         """Move to a device."""
-
-    def predict_batch(self, clouds: Iterable[Cloud], refine: bool | None = None) -> list[ScanPrediction]:
-        """`predict` of every cloud, one after the other; clouds may differ in size, and none changes another's."""
-        return [self.predict(cloud, refine) for cloud in clouds]
 
 
 class ArticulatedPoseEstimator(Estimator):
@@ -127,13 +135,13 @@ class ArticulatedPoseEstimator(Estimator):
         self.device = torch.device(device)
         self.module = module.to(self.device)
 
-    def predict(self, points: Cloud, refine: bool | None = None) -> ScanPrediction:
-        """See `Estimator.predict`."""
-        cloud = as_cloud(points)
+    def predict_batch(self, clouds: Iterable[Cloud], refine: bool | None = None) -> list[ScanPrediction]:
+        """See `Estimator.predict_batch`."""
+        read = [as_cloud(cloud) for cloud in clouds]
         with flush_denormals():
-            estimate = self.module.predict_cloud(cloud, refine)
-        upright = self.module.orientation.limited
-        return in_scan_frame(estimate, cloud, self.module.state_range, self.category, self.weights, upright)
+            estimates = self.module.predict_clouds(read, refine)
+        about = self.module.state_range, self.category, self.weights, self.module.orientation.limited
+        return [in_scan_frame(estimate, cloud, *about) for estimate, cloud in zip(estimates, read, strict=True)]
 
     def to(self, device: str | torch.device) -> Self:
         """Move to a device."""
@@ -158,14 +166,18 @@ class EstimatorChoice(Estimator):
         self.estimators, self.category = tuple(estimators), category
         self.device = self.estimators[0].device
 
-    def predict(self, points: Cloud, refine: bool | None = None) -> ScanPrediction:
-        """See `Estimator.predict`; `checkpoint` of the result names the weights."""
-        return self.compare(points, refine)[0]
+    def predict_batch(self, clouds: Iterable[Cloud], refine: bool | None = None) -> list[ScanPrediction]:
+        """See `Estimator.predict_batch`; `checkpoint` of each result names the weights that answered."""
+        return [candidates[0] for candidates in self._compare_batch(clouds, refine)]
 
     def compare(self, points: Cloud, refine: bool | None = None) -> list[ScanPrediction]:
         """What every set of weights predicts, the best explanation first (`ranked`)."""
-        cloud = as_cloud(points)
-        return ranked(estimator.predict(cloud, refine) for estimator in self.estimators)
+        return self._compare_batch([points], refine)[0]
+
+    def _compare_batch(self, clouds: Iterable[Cloud], refine: bool | None) -> list[list[ScanPrediction]]:
+        read = [as_cloud(cloud) for cloud in clouds]
+        answers = [estimator.predict_batch(read, refine) for estimator in self.estimators]
+        return [ranked(candidates) for candidates in zip(*answers, strict=True)]
 
     def to(self, device: str | torch.device) -> Self:
         """Move all to a device."""

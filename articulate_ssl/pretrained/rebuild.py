@@ -1,13 +1,13 @@
 """`make weights`: every set of shipped weights from nothing, by the commands that the cards state.
 
-For each category and view: data, fit, test, pack. Each is a program of its own, whose words go to a log file; a stage
-that has finished leaves a note of its command and is not repeated, and a fit that was cut off goes on from its last
-checkpoint. Data are deleted once their weights are packed: all of them would fill ten gigabytes.
+For each category and view: data, fit, test, pack. The first three are programs of their own, whose words go to log
+files; a stage that has finished leaves a note of its command and is not repeated, and a fit that was cut off goes on
+from its last checkpoint. Data are deleted once their weights are packed: all of them would fill ten gigabytes. It may
+be killed at any moment.
 """
 
 from __future__ import annotations
 
-import json
 import shutil
 import subprocess
 import sys
@@ -15,37 +15,19 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from articulate_ssl.inference.checkpoint_file import CheckpointError
 from articulate_ssl.pretrained.pack import VIEW_OF_DATA, fit_command, newest_metrics, pack
+from articulate_ssl.pretrained.stages import Stage, StageFailed, Workplace
 from articulate_ssl.training.shipped_weights import WEIGHTS_FOLDER
 from articulate_ssl.training.weights_card import CARD_SUFFIX
 from articulate_ssl.training.weights_file import SUFFIX
-from datamodules.atomic import atomic_write
 
 # All but laptop_real, whose objects are laptops.
 CATEGORIES = ("laptop", "oven", "eyeglasses", "washing_machine", "safe", "drawer", "desk_lamp")
 DATA_SEED = 11  # no other: README's numbers are of 1 to 4
 FIT_SEED = 0
 DEPTH_OPTIONS = ("--states", "30", "--views", "4")  # more states and views teach no more, and take longer
-
-
-class StageFailed(RuntimeError):
-    """A stage ended with an error; the message names it and its log."""
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One step to a set of weights.
-
-    Attributes:
-        name: `data`, `fit` or `test`.
-        command: Words of the program.
-    """
-
-    name: str
-    command: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -75,6 +57,10 @@ class Rebuild:
         return self.build / self.name
 
     @property
+    def _work(self) -> Workplace:
+        return Workplace(self.name, self.place)
+
+    @property
     def data_root(self) -> Path:
         """Of its own, so that it can be deleted alone."""
         return self.place / "data"
@@ -100,57 +86,38 @@ class Rebuild:
             StageFailed: if a program fails; what is finished stays.
             CheckpointError: if the run cannot be packed.
         """
-        stages = self.stages()
-        if all(self._noted(stage).get("seconds") is not None for stage in stages) and self._written():
-            say(f"{self.name}: done before")
-            return
-        self.place.mkdir(parents=True, exist_ok=True)
-        again = False
-        for stage in stages:
-            again = self._do(stage, again, say)
-        pack(newest_metrics(self.place / "run"), commit=commit_of(Path.cwd()), folder=self.folder)
-        shutil.rmtree(self.data_root)
-        say(f"{self.name}: packed")
+        work, programs = self._work, self.stages()
+        # Weights of this name may be older ones, hence a note that it was these.
+        packed = Stage("pack", tuple(word for stage in programs for word in stage.command))
+        done = work.seconds(packed) is not None and self._written()
+        if not done:
+            again = False
+            for stage in programs:
+                again = self._do(stage, again, say)
+            start = time.monotonic()
+            pack(newest_metrics(self.place / "run"), commit=commit_of(Path.cwd()), folder=self.folder)
+            work.finished(packed, time.monotonic() - start)
+        self._delete_data()
+        say(f"{self.name}: {'done before' if done else 'packed'}")
+
+    def _delete_data(self) -> None:
+        """All or nothing under their name: what is half deleted is never taken for data."""
+        rest = self.place / "deleted"
+        shutil.rmtree(rest, ignore_errors=True)
+        if self.data_root.is_dir():
+            self.data_root.rename(rest)
+            shutil.rmtree(rest)
 
     def _do(self, stage: Stage, again: bool, say: Callable[[str], None]) -> bool:
         """Run a stage if it is not done, or `again`; whether those behind it must run again."""
-        note = self._noted(stage)
-        finished = note.get("seconds") is not None and not again
+        work = self._work
+        finished = work.seconds(stage) is not None and not again
         if finished and (stage.name != "data" or self.data_root.is_dir()):
             say(f"{self.name}: {stage.name} done before")
             return False
-        command = list(stage.command)
-        if stage.name == "fit":
-            command += self._resumed(begun=bool(note) and not again)
-        self._note(stage, None)
-        log, start = self.place / f"{stage.name}.log", time.monotonic()
-        say(f"{self.name}: {stage.name} … ({log})")
-        with log.open("w") as output:
-            code = subprocess.run(command, stdout=output, stderr=subprocess.STDOUT, check=False).returncode
-        if code:
-            raise StageFailed(f"{self.name}: {stage.name} failed with exit code {code}; {log} says why")
-        seconds = round(time.monotonic() - start)
-        self._note(stage, seconds)
-        say(f"{self.name}: {stage.name} took {seconds} s")
+        go_on = resumed(self.place / "run", work.begun(stage) and not again) if stage.name == "fit" else ()
+        work.run(stage, say, go_on)
         return not finished  # data that were deleted come back the same, byte for byte
-
-    def _resumed(self, begun: bool) -> list[str]:
-        """Options of a fit that goes on where this very command was cut off; what another command left is deleted."""
-        run = self.place / "run"
-        if not begun:
-            shutil.rmtree(run, ignore_errors=True)
-        last = max(run.glob("**/checkpoints/last.ckpt"), key=lambda path: path.stat().st_mtime, default=None)
-        return [] if last is None else ["--ckpt_path", str(last)]
-
-    def _noted(self, stage: Stage) -> dict[str, Any]:
-        """What this very command left: `seconds`, None if it was cut off; empty if it never ran."""
-        file = self.place / f"{stage.name}.json"
-        note = json.loads(file.read_text()) if file.is_file() else {}
-        return note if note.get("command") == list(stage.command) else {}
-
-    def _note(self, stage: Stage, seconds: int | None) -> None:
-        with atomic_write(self.place / f"{stage.name}.json") as file:
-            file.write(json.dumps({"command": stage.command, "seconds": seconds}).encode())
 
     def _written(self) -> bool:
         return all((self.folder / f"{self.name}{suffix}").is_file() for suffix in (SUFFIX, CARD_SUFFIX))
@@ -177,6 +144,14 @@ def rebuild(
                 failed.append(str(error))
                 say(str(error))
     return failed
+
+
+def resumed(run: Path, begun: bool) -> tuple[str, ...]:
+    """Options of a fit that goes on where this very command was cut off; what another command left is deleted."""
+    if not begun:
+        shutil.rmtree(run, ignore_errors=True)
+    last = max(run.glob("**/checkpoints/last.ckpt"), key=lambda path: path.stat().st_mtime, default=None)
+    return () if last is None else ("--ckpt_path", str(last))
 
 
 def commit_of(folder: Path) -> str:

@@ -29,13 +29,14 @@ NETWORK = NetworkOptions(
 )
 # Not all of the synthetic set's 12 training clouds: a choice among them that reads a label would show in the weights.
 DISCOVERY = DiscoveryOptions(
-    clouds=8,
-    split_clouds=8,
+    clouds=6,
+    split_clouds=6,
     points=POINTS,
     references=1,
-    starts=4,
-    jointed=2,
+    starts=2,
+    jointed=1,
     rounds=1,
+    edge_hinges=False,
     proposals=["random_cuts"],
     cycles=1,
     min_share=0.02,

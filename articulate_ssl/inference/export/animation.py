@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from itertools import pairwise
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from PIL import Image
 
 from articulate_ssl.inference.pictures.picture import moving_figures
 from articulate_ssl.inference.scan_prediction import ScanPrediction
+from articulate_ssl.ops.progress import announced
 from datamodules.atomic import atomic_write
 
 FRAMES = 30  # of all joints together: four seconds, and few enough for 1 MB
@@ -28,6 +30,8 @@ MAX_DRAWN_POINTS = 4096
 # For a person to follow; chosen without a measurement. The first frame, which is the prediction, is held.
 FRAME_SECONDS, FIRST_SECONDS = 0.08, 0.8
 
+log = logging.getLogger(__name__)
+
 
 def write(result: ScanPrediction, folder: Path) -> list[Path]:
     """Write `moving.gif`: the predicted object, its joints moving one by one, and the scan faintly behind; return it.
@@ -42,7 +46,8 @@ def write(result: ScanPrediction, folder: Path) -> list[Path]:
     size = FIGURE_WIDTH, FIGURE_WIDTH * HEIGHT / WIDTH
     points, part_id = result.cloud[drawn], result.part_id[drawn]
     figures = moving_figures(result.prediction, points, part_id, result.limits, states, size, result.upright)
-    frames = _of_one_palette([_pixels(figure) for figure in figures])
+    told = announced(log, f"drawing {file.name}", states)
+    frames = _of_one_palette([_pixels(figure) for _, figure in zip(told, figures, strict=True)])
     milliseconds = [round(1000 * FIRST_SECONDS)] + [round(1000 * FRAME_SECONDS)] * (len(frames) - 1)
     with atomic_write(file) as opened:
         frames[0].save(

@@ -6,7 +6,7 @@ Convention:
     a joint's axis has the same coordinates in its parent's frame, its child's frame and canonical object space. A
     positive state turns counter-clockwise seen from the tip of the axis, or moves along it. `pose` of the object takes
     the root link to the scan. Lengths are in the unit of the scan, which readers of these formats take for metres, and
-    so do the masses: they are those of solid parts of `DENSITY` kilograms per cubic unit.
+    so do the masses: meshes filled with `DENSITY` kilograms per cubic unit.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ import trimesh
 
 from articulate_ssl.geometry.screw import screw_motion
 from articulate_ssl.inference.articulation import canonical_object
+from articulate_ssl.inference.export.apart import half_spaces, kept, trimmed
+from articulate_ssl.inference.export.hollow import Slide, hollow_parents
 from articulate_ssl.inference.export.part_mesh import part_mesh
 from articulate_ssl.inference.pictures.part_colour import part_colour
 from articulate_ssl.inference.prediction import Prediction
@@ -139,22 +141,31 @@ class RigidObject:
 
 
 def rigid_object(result: ScanPrediction) -> RigidObject:
-    """Links and joints of a prediction; limits are widened to hold the predicted states."""
+    """Links and joints of a prediction; limits are widened to hold the predicted states.
+
+    Parts that slide side by side do not meet (`apart`), and what slides through a part is cut out of it (`hollow`).
+    """
     prediction = result.prediction
     child = prediction.joint_child[0].tolist()
     origin = np.zeros((prediction.num_parts, 3))
     origin[child] = prediction.canonical_pivot[0].numpy()
     shapes = canonical_object(prediction)[0].double().numpy()
     extent = float(np.ptp(shapes, axis=(0, 1)).max())
-    meshes = [_with_substance(_remembered_mesh(shape.tobytes()), MIN_PART * extent) for shape in shapes]
+    joints = tuple(
+        _joint(prediction, j, origin, limits, extent) for j, limits in enumerate(result.limits.double().numpy())
+    )
+    slides = [Slide(j.parent, j.child, j.axis, j.lower, j.upper) for j in joints if j.kind == "prismatic"]
+    meshes = []
+    for shape, spaces in zip(shapes, half_spaces(shapes, slides), strict=True):
+        mesh = _with_substance(_remembered_mesh(kept(shape, spaces).tobytes()), MIN_PART * extent)
+        meshes.append(trimmed(mesh, spaces))
+    meshes = hollow_parents(meshes, slides)
     return RigidObject(
         name=result.category,
         pose=prediction.base_pose[0].double().numpy(),
         root=next(k for k in range(prediction.num_parts) if k not in child),
         links=tuple(_link(k, mesh, origin[k]) for k, mesh in enumerate(meshes)),
-        joints=tuple(
-            _joint(prediction, j, origin, limits, extent) for j, limits in enumerate(result.limits.double().numpy())
-        ),
+        joints=joints,
         upright=result.upright,
     )
 

@@ -11,6 +11,7 @@ from scan_predictions import result_of
 from articulate_ssl.cli.predict import run
 from articulate_ssl.geometry.orientation_range import OrientationRange
 from articulate_ssl.inference.checkpoint_file import CHECKPOINT_KEY, read_checkpoint
+from articulate_ssl.inference.export import animation
 from articulate_ssl.inference.point_cloud_io import normalise_cloud
 from articulate_ssl.inference.prediction import Prediction, ScanEstimate
 from articulate_ssl.inference.viewer import html_page
@@ -26,8 +27,11 @@ class FakeModule(torch.nn.Module):
     orientation = OrientationRange()
     probability = unlike = None
 
-    def predict_cloud(self, points, refine):
+    def predict_clouds(self, clouds, refine):
         self.refine = refine
+        return [self.predict_cloud(points) for points in clouds]
+
+    def predict_cloud(self, points):
         prediction, truth = synthetic.laptop()
         normalised, center, scale = normalise_cloud(points, 256)
         _, true_center, true_scale = normalise_cloud(truth.numpy(), 256)
@@ -93,6 +97,14 @@ def test_a_scan_becomes_a_folder_of_results_and_a_summary(scan_folder, module, c
     assert all(name.split("/")[-1] in captured.out for name in found)
     assert "laptop" in captured.out and "revolute" in captured.out and "68.8°" in captured.out
     assert module.refine is True
+
+
+def test_drawing_a_moving_picture_is_told_on_stderr(scan_folder, module, capsys, monkeypatch):
+    monkeypatch.setattr(animation, "FRAMES", 4)
+    assert predict("scan.npy", "--ckpt", "laptop.ckpt", "--out", "results", "--formats", "gif") == 0
+    captured = capsys.readouterr()
+    assert "drawing moving.gif: took" in captured.err and "drawing" not in captured.out
+    assert (scan_folder / "results/moving.gif").is_file()
 
 
 def test_the_answer_is_in_the_frame_of_the_scan(scan_folder, module):
@@ -162,7 +174,7 @@ def test_a_device_that_is_not_there_exits_2(scan_folder, module, capsys, device)
 
 
 def test_a_bug_is_not_reported_as_bad_input(scan_folder, module):
-    module.predict_cloud = lambda points, refine: [][1]
+    module.predict_clouds = lambda clouds, refine: [][1]
     with pytest.raises(IndexError):
         predict("scan.npy", "--ckpt", "laptop.ckpt")
 

@@ -76,20 +76,20 @@ def test_hypotheses_outside_the_range_win_only_where_there_is_no_other():
 
 
 def test_like_parts_are_told_apart_within_a_range():
-    data = clouds(BOOK, count=14, points=256, resample=True, rotate=False, seed=1)
-    turn = se3(_turns(40.0, 14), torch.zeros(14, 3))
+    data = clouds(BOOK, count=10, points=192, resample=True, rotate=False, seed=1)
+    turn = se3(_turns(40.0, 10), torch.zeros(10, 3))
     points = data.points @ turn[:, :3, :3].mT
     true = turn[:, :3, :3] @ data.base[:, :3, :3]
     small = DiscoveryOptions(
-        clouds=14,
-        search_clouds=14,
-        split_clouds=12,
+        clouds=10,
+        search_clouds=10,
+        split_clouds=8,
         references=1,
-        starts=6,
-        jointed=3,
+        starts=4,
+        jointed=2,
         rounds=1,
         proposals=["random_cuts"],
-        cycles=6,
+        cycles=3,
     )
 
     def found(degrees):

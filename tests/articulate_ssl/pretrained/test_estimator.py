@@ -11,7 +11,9 @@ from tiny import fit, tiny_module
 
 import articulate_ssl
 from articulate_ssl import ArticulatedPoseEstimator, ArticulatedPoseModule, ScanPrediction, load
+from articulate_ssl.inference import pose_estimation
 from articulate_ssl.inference.checkpoint_file import CheckpointError
+from articulate_ssl.inference.pose_estimation import PoseEstimator
 from articulate_ssl.pretrained.estimator import EstimatorChoice
 from articulate_ssl.training import shipped_weights
 from articulate_ssl.training.weights_file import write_weights
@@ -62,12 +64,33 @@ def test_arrays_tensors_and_files_are_predicted_alike(folder, cloud, tmp_path):
     estimator = load(folder / "trained.ckpt")
     np.save(tmp_path / "scan.npy", cloud)
     clouds = [cloud, torch.from_numpy(cloud), cloud.tolist(), tmp_path / "scan.npy", str(tmp_path / "scan.npy")]
-    first, *others = estimator.predict_batch(clouds)
+    first, *others = (estimator.predict(one) for one in clouds)
     assert isinstance(first, ScanPrediction)
     for other in others:
         assert other.to_dict() == first.to_dict()
         np.testing.assert_array_equal(other.part_id, first.part_id)
     np.testing.assert_allclose(first.cloud, cloud)
+
+
+def test_a_batch_goes_through_together_and_is_predicted_as_one_by_one(folder, cloud, monkeypatch):
+    estimator = load(folder / "trained.ckpt")
+    clouds = [cloud, cloud * 1000, cloud[:, ::-1] + np.array([0, 0, 9]), np.concatenate([cloud, cloud * 0.99])]
+    alone = [estimator.predict(one) for one in clouds]
+    sizes, predict = [], PoseEstimator.predict_with_rivals
+
+    def counted(self, points, *arguments):
+        sizes.append(len(points) // len(pose_estimation._SCALE_STARTS))
+        return predict(self, points, *arguments)
+
+    monkeypatch.setattr(PoseEstimator, "predict_with_rivals", counted)
+    monkeypatch.setattr(pose_estimation, "_SCANS_AT_ONCE", 3)
+    for batched, single in zip(estimator.predict_batch(clouds), alone, strict=True):
+        np.testing.assert_array_equal(batched.part_id, single.part_id)
+        np.testing.assert_allclose(batched.states, single.states, atol=1e-4)
+        np.testing.assert_allclose(batched.scale, single.scale)
+        np.testing.assert_allclose(batched.reconstruction, single.reconstruction, atol=1e-4 * single.scale)
+    assert sizes == [3, 1]
+    assert estimator.predict_batch([]) == []
 
 
 def test_the_answer_is_in_the_unit_of_the_scan(folder, cloud):
@@ -115,6 +138,7 @@ def test_of_several_the_one_that_explains_the_scan_best_answers(folder, cloud):
     assert [result.checkpoint for result in found][-1] == ignorant.weights
     assert choice.predict(cloud).to_dict() == found[0].to_dict()
     assert choice.predict(cloud).checkpoint == found[0].checkpoint != ignorant.weights
+    assert [result.checkpoint for result in choice.predict_batch([cloud] * 2)] == [found[0].checkpoint] * 2
 
 
 def test_estimators_move_to_devices(folder):

@@ -1,14 +1,19 @@
 """`make weights` does every stage once, goes on where it was killed, and never mixes two commands' results."""
 
+import json
+import multiprocessing
+import os
 import shutil
-import subprocess
+import signal
+import sys
+import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from articulate_ssl.pretrained import rebuild as module
-from articulate_ssl.pretrained.rebuild import CATEGORIES, Rebuild, StageFailed, commit_of, rebuild
+from articulate_ssl.pretrained import stages
+from articulate_ssl.pretrained.rebuild import CATEGORIES, Rebuild, Stage, StageFailed, commit_of, rebuild
 from render.generate import _parser
 
 
@@ -18,7 +23,7 @@ class Programs:
     def __init__(self, place: Path) -> None:
         self.place, self.commands, self.fails = place, [], None
 
-    def __call__(self, command, **_):
+    def __call__(self, command, log, lock, tick):
         name = next(word for word in ("fit", "test", "render.generate") if word in command)
         self.commands.append((name, list(command)))
         if name == "render.generate":
@@ -28,12 +33,12 @@ class Programs:
             folder.mkdir(parents=True, exist_ok=True)
             (folder / "last.ckpt").touch()
         if self.fails == name:
-            return SimpleNamespace(returncode=1)
+            return 1
         if self.fails == f"{name} killed":
             raise KeyboardInterrupt
         if name == "test":
             (self.place / "run" / "metrics.json").write_text("{}")
-        return SimpleNamespace(returncode=0)
+        return 0
 
     @property
     def names(self) -> list[str]:
@@ -48,7 +53,7 @@ def plan(tmp_path) -> Rebuild:
 @pytest.fixture
 def programs(plan, monkeypatch):
     programs = Programs(plan.place)
-    monkeypatch.setattr(module, "subprocess", SimpleNamespace(run=programs, STDOUT=subprocess.STDOUT))
+    monkeypatch.setattr(stages, "run_program", programs)
     monkeypatch.setattr(module, "commit_of", lambda _folder: "abc")
 
     def pack(metrics, commit, folder):
@@ -86,6 +91,20 @@ def test_weights_that_were_deleted_are_packed_again_without_training(plan, progr
     shutil.rmtree(plan.folder)
     plan.run(print)
     assert programs.names == ["render.generate", "fit", "test", "render.generate"]
+
+
+def test_weights_of_before_are_not_taken_for_new_ones(plan, programs):
+    """As in the package, which has weights of every name."""
+    plan.folder.mkdir()
+    for suffix in (".safetensors", ".json"):
+        (plan.folder / f"oven-depth{suffix}").write_text("old")
+    programs.fails = "test killed"
+    with pytest.raises(KeyboardInterrupt):
+        plan.run(print)
+    programs.fails = None
+    said = []
+    plan.run(said.append)
+    assert said[-1] == "oven-depth: packed" and programs.names == ["render.generate", "fit", "test", "test"]
 
 
 def test_another_seed_does_everything_anew(plan, programs, monkeypatch):
@@ -129,3 +148,130 @@ def test_every_command_is_one_that_its_program_takes(tmp_path, category, view):
 def test_the_commit_is_that_of_the_folder(tmp_path):
     assert len(commit_of(Path(__file__).parent).rstrip("+")) == 40
     assert commit_of(tmp_path) == "unknown"
+
+
+# Notes when it starts and ends, leaves what its stage leaves, and takes its time where it is told to.
+PROGRAM = """
+import json, sys, time
+from pathlib import Path
+
+stage, place, *options = sys.argv[1:]
+place = Path(place)
+
+def note(what):
+    with (place / "events.txt").open("a") as file:
+        file.write(json.dumps([stage, what, options]) + "\\n")
+
+note("begins")
+if stage == "data":
+    (place / "data").mkdir(exist_ok=True)
+elif stage == "fit":
+    (place / "run" / "checkpoints").mkdir(parents=True, exist_ok=True)
+    (place / "run" / "checkpoints" / "last.ckpt").touch()
+if (place.parent / f"slow {stage}").exists():
+    (place.parent / f"slow {stage}").unlink()
+    time.sleep(float(sys.argv[3]))
+elif stage == "test":
+    (place / "run" / "metrics.json").write_text("{}")
+note("ends")
+"""
+
+
+class Little(Rebuild):
+    """A rebuild whose programs do nothing, for `seconds` where a file says which is to be slow."""
+
+    seconds = 60.0
+
+    def stages(self) -> tuple[Stage, ...]:
+        return tuple(
+            Stage(name, (sys.executable, "-c", PROGRAM, name, str(self.place), str(self.seconds)))
+            for name in ("data", "fit", "test")
+        )
+
+    def events(self) -> list[list]:
+        lines = (self.place / "events.txt").read_text().splitlines() if self.place.is_dir() else []
+        return [json.loads(line) for line in lines]
+
+
+def slow_pack(metrics: Path, commit: str, folder: Path) -> None:
+    folder.mkdir(exist_ok=True)
+    (folder / "oven-depth.safetensors").write_text("new")
+    slow = metrics.parents[2] / "slow pack"
+    if slow.exists():
+        slow.unlink()
+        time.sleep(60)
+    (folder / "oven-depth.json").write_text("new")
+
+
+@pytest.fixture
+def little(tmp_path, monkeypatch) -> Little:
+    monkeypatch.setattr(module, "pack", slow_pack)
+    (tmp_path / "build").mkdir()
+    return Little("oven", "depth", tmp_path / "build", tmp_path / "weights")
+
+
+def run_and_kill(plan: Little, stage: str, everything: bool) -> None:
+    """Kill -9 in the midst of a stage: the rebuild with its program, or the rebuild alone."""
+    slow = plan.build / f"slow {stage}"
+    slow.touch()
+
+    def work() -> None:
+        os.setsid()
+        plan.run(print)
+
+    process = multiprocessing.get_context("fork").Process(target=work)
+    process.start()
+    while slow.exists():
+        assert process.is_alive()
+        time.sleep(0.01)
+    (os.killpg if everything else os.kill)(process.pid, signal.SIGKILL)
+    process.join()
+
+
+@pytest.mark.parametrize("stage", ["data", "fit", "test", "pack"])
+def test_after_kill_9_in_any_stage_it_goes_on_with_that_stage(little, stage):
+    run_and_kill(little, stage, everything=True)
+    said = []
+    little.run(said.append)
+    begun = [(name, "--ckpt_path" in options) for name, what, options in little.events() if what == "begins"]
+    assert (
+        begun
+        == {
+            "data": [("data", False), ("data", False), ("fit", False), ("test", False)],
+            "fit": [("data", False), ("fit", False), ("fit", True), ("test", False)],
+            "test": [("data", False), ("fit", False), ("test", False), ("test", False)],
+            "pack": [("data", False), ("fit", False), ("test", False)],
+        }[stage]
+    )
+    assert said[-1] == "oven-depth: packed" and not little.data_root.exists()
+    assert [file.read_text() for file in little.folder.iterdir()] == ["new", "new"]
+
+
+def test_a_program_that_outlives_a_killed_rebuild_is_waited_for(little, monkeypatch):
+    monkeypatch.setattr(Little, "seconds", 1.0)
+    run_and_kill(little, "fit", everything=False)
+    said = []
+    little.run(said.append)
+    assert "waiting" in said[1] and said[-1] == "oven-depth: packed"
+    fits = [what for name, what, _ in little.events() if name == "fit"]
+    assert fits == ["begins", "ends"] * 2  # one after the other
+
+
+def test_data_that_were_half_deleted_are_not_taken_for_data(little, monkeypatch):
+    class Killed(BaseException):
+        pass
+
+    def delete(folder, **_):
+        if Path(folder).is_dir():
+            raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module.shutil, "rmtree", delete)
+        little.place.mkdir()
+        (little.place / "run").mkdir(parents=True)
+        (little.place / "data").mkdir()
+        with pytest.raises(Killed):
+            little._delete_data()
+    assert not little.data_root.exists()
+    little.run(print)
+    assert [file.name for file in little.place.glob("*/") if file.name in ("data", "deleted")] == []

@@ -1,3 +1,4 @@
+import logging
 from dataclasses import replace
 from itertools import pairwise
 
@@ -51,6 +52,14 @@ def test_it_repeats_for_ever_at_the_promised_size_and_holds_the_prediction(tmp_p
         seconds = [frame.info["duration"] / 1000 for frame in ImageSequence.Iterator(picture)]
     assert seconds[0] == animation.FIRST_SECONDS
     assert set(seconds[1:]) == {animation.FRAME_SECONDS}
+
+
+def test_every_frame_is_told(tmp_path, caplog):
+    with caplog.at_level(logging.INFO, logger="articulate_ssl"):
+        animation.write(result_of(synthetic.laptop, state_range=WIDE), tmp_path)
+    told = [record.stage for record in caplog.records if hasattr(record, "stage")]
+    assert {stage.work for stage in told} == {"drawing moving.gif"}
+    assert [(stage.done, stage.total) for stage in told] == [(i, animation.FRAMES) for i in range(animation.FRAMES + 1)]
 
 
 def test_the_bytes_are_the_same_every_time_and_nothing_else_is_left(tmp_path):

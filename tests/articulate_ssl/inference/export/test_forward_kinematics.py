@@ -12,7 +12,7 @@ import trimesh
 import yourdfpy
 from joint_zoo import ZOO
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
-from scan_predictions import result_of
+from scan_predictions import keep_solid, result_of
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -23,6 +23,11 @@ from articulate_ssl.inference.scan_prediction import ScanPrediction
 # Files hold float32 numbers of coordinates up to 10 (the scans lie away from the origin).
 TOLERANCE = 1e-5
 STATES = 5
+
+
+@pytest.fixture(autouse=True)
+def solid(monkeypatch):
+    keep_solid(monkeypatch)
 
 
 def states_of(result: ScanPrediction) -> np.ndarray:  # [STATES, J]

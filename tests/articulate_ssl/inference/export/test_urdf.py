@@ -6,11 +6,16 @@ import synthetic_predictions as synthetic
 import torch
 import trimesh
 import yourdfpy
-from scan_predictions import OBJECTS, result_of
+from scan_predictions import OBJECTS, keep_solid, result_of
 
 from articulate_ssl.inference.articulation import articulate, posed_parts
 from articulate_ssl.inference.export import urdf
 from articulate_ssl.inference.prediction import Prediction
+
+
+@pytest.fixture(autouse=True)
+def solid(monkeypatch):
+    keep_solid(monkeypatch)
 
 
 def write(folder, make) -> tuple[Prediction, yourdfpy.URDF]:
