@@ -21,7 +21,8 @@ DIRECTIONS = 90  # that are tried across the axis: every two degrees
 # Of the points of either part that may lie beyond the plane; more, and one slides within the other. A third of a
 # drawer's points were wrong on the worst twin (IoU .68).
 MOST_BEYOND = 0.3
-CLEARANCE = 0.002  # between two parts, half of it on either side; of the larger one's extent. Chosen, not measured
+LEAST_KEPT = 0.25  # of a part's points: less tells no shape. Chosen without a measurement, as is the next
+CLEARANCE = 0.002  # between two parts, half of it on either side; of the larger one's extent
 
 
 class HalfSpace(NamedTuple):
@@ -64,8 +65,9 @@ def kept(
     points: np.ndarray,  # [M, 3]
     spaces: Sequence[HalfSpace],
 ) -> np.ndarray:  # [m, 3]
-    """The points that are in all of them."""
-    return points[np.all([np.ones(len(points), dtype=bool), *(space.holds(points) for space in spaces)], axis=0)]
+    """The points that are in all of them; all points where that is hardly any, as of two plates face to face."""
+    inside = np.all([np.ones(len(points), dtype=bool), *(space.holds(points) for space in spaces)], axis=0)
+    return points[inside] if inside.mean() >= LEAST_KEPT else points
 
 
 def _plane_between(

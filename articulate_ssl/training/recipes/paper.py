@@ -1,7 +1,7 @@
 """The paper's recipe: its objective from the first step on; no discovery, no registration.
 
 The objective alone has a stable optimum in which one part is everything and no joint moves (findings, section 4). What
-keeps the parts alive, each an option:
+keeps the parts alive, each but the first with an option:
 
 1. Parts start apart, as flaps about a joint (`CategoryObject.start_apart`), not as one cloud of points.
 2. Hypotheses start from several joint states beside the rotations (`network.state_anchors`), and for the first
@@ -9,11 +9,12 @@ keeps the parts alive, each an option:
    the one state that explains most, and within two hundred steps no other is ever chosen. That objects are spread
    evenly over their range of articulation is how the paper makes its sets.
 3. For the first `schedule.equal_parts_share` of the steps parts are drawn, less and less, to equal shares of a cloud
-   (Sinkhorn's rounds of the posterior association). Without it the states stayed unrelated to the true ones.
+   (Sinkhorn's rounds of the posterior association). Without it the states of laptops stayed unrelated to the true ones.
 4. For the first `schedule.shared_share` of the steps all instances have one shape: with their own they explain
    articulation by shape. Then they are freed.
 5. Posed parts teach the slots, which after `schedule.agreement_share` of the steps have a say in which hypothesis is
-   chosen (`objective.association`, `.agreement`). From the first step on they held on to a split that was not one.
+   chosen (`objective.association`, `.agreement`). With a say from the first step on they held on to a split that was
+   not one (seen once, with other changes beside it).
 """
 
 from __future__ import annotations

@@ -4,14 +4,15 @@ import json
 
 import numpy as np
 import pytest
-from twin_objects import drawer, scans, with_little_effort
+from twin_objects import drawer, scans, true_object
 
 from articulate_ssl.cli import main
+from articulate_ssl.inference import twin
 
 
 @pytest.fixture
 def scan_files(tmp_path, monkeypatch):
-    with_little_effort(monkeypatch)
+    monkeypatch.setattr(twin, "find_one_object", true_object)  # found for real in tests/articulate_ssl/inference
     monkeypatch.chdir(tmp_path)
     names = [f"{i}.npy" for i in range(8)]
     for name, cloud in zip(names, scans(drawer()), strict=True):
@@ -29,7 +30,9 @@ def test_scans_become_a_folder(scan_files, tmp_path, capsys):
     assert list(json.loads((tmp_path / "twin" / "states.json").read_text())) == scan_files
 
 
-def test_too_few_scans_are_refused(scan_files, tmp_path, capsys):
+def test_too_few_scans_are_refused(scan_files, tmp_path, capsys, monkeypatch):
+    monkeypatch.undo()
+    monkeypatch.chdir(tmp_path)
     assert main(["twin", *scan_files[:3], "--parts", "2"]) == 2
     assert "3 clouds of one object, at least 8 are needed" in capsys.readouterr().err
     assert not (tmp_path / "twin").exists()

@@ -52,6 +52,14 @@ def test_parts_that_are_in_each_other_or_slide_elsewhere_are_left_alone():
     assert half_spaces(points, chain) == [[], [], []]
 
 
+def test_plates_face_to_face_keep_their_points():
+    plate = np.concatenate([np.random.default_rng(0).random((400, 2)), np.zeros((400, 1))], axis=1)
+    points = [np.zeros((4, 3)), plate, plate + np.array([0, 0, 1e-4])]
+    spaces = half_spaces(points, slides((1.0, 0, 0), (1.0, 0, 0)))
+    assert len(spaces[1]) == 1 and not spaces[1][0].holds(plate).any()
+    assert kept(plate, spaces[1]) is plate
+
+
 def test_a_mesh_is_closed_where_it_is_cut_off():
     spaces = half_spaces(two_rods(0.0), slides(AXIS, AXIS))[1]
     block = trimesh.creation.box((0.4, 0.4, 0.4))
