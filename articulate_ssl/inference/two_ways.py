@@ -30,7 +30,7 @@ _ALIKE = np.radians(25)  # rotations closer than this are the same twin
 # Of the clouds, that must have the same twin; and by how much their two explanations may differ in fit. Chosen.
 _COMMON, _CLOSE = 0.5, 0.25
 _CENTERS = 100  # pairs that are tried as the most frequent relation
-_FEWEST = 100  # clouds from which a decision is learnt
+FEWEST = 100  # clouds from which a decision is learnt
 _RIDGE = 0.3  # of discriminant analysis, in units of a standardised feature's variance
 _CAP = 3.0  # standard deviations, beyond which a feature counts as this far
 _COMPONENTS = (2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24)  # whitened principal directions, tried in turn
@@ -84,7 +84,7 @@ class TwoWays(nn.Module):
     ) -> bool:
         """Take the most frequent relation between explanations that fit alike. False, if there is none."""
         close = margin < _CLOSE
-        if close.sum() < max(_FEWEST, _COMMON * len(margin)):
+        if close.sum() < max(FEWEST, _COMMON * len(margin)):
             return False
         chosen, rival = chosen[close].double(), rival[close].double()
         # Whose twin is whose is open: both ways are examples.
@@ -106,7 +106,7 @@ class TwoWays(nn.Module):
         """Find the direction that parts the differences. False, if there are too few."""
         difference = (one - other).double().cpu().numpy()
         difference = difference[np.isfinite(difference).all(axis=1)]
-        if len(difference) < _FEWEST:
+        if len(difference) < FEWEST:
             return False
         scale = np.sqrt((difference**2).mean(axis=0)) + 1e-9
         weight = decision_direction(np.clip(difference / scale, -_CAP, _CAP))

@@ -9,12 +9,14 @@ import torch
 from torch import Tensor
 
 from articulate_ssl.inference.prediction import Prediction, concatenate
+from articulate_ssl.inference.two_ways import FEWEST
 from articulate_ssl.ops.progress import announced
 
 if TYPE_CHECKING:
     from articulate_ssl.training.module import ArticulatedPoseModule
 
 _BATCH = 16
+_RELATED = 208  # clouds that show whether, and how, two explanations are related: that takes fewer than the decision
 
 log = logging.getLogger(__name__)
 
@@ -25,17 +27,18 @@ def learn_two_ways(
     clouds: Tensor,  # [n, N, 3] farthest-point order, dense
 ) -> None:
     """Find out whether rivals are alike in all clouds; if so, tell the two apart by the relief of both."""
+    if len(clouds) < FEWEST:
+        log.info("no decision between two explanations: it takes %d training clouds, there are %d", FEWEST, len(clouds))
+        return
     estimator, count = module.estimator, max(module.num_points, module.inference.points)
-    batches = clouds.split(_BATCH)
-    shown = announced(log, "two explanations, their relation", batches)
+    shown = announced(log, "two explanations, their relation", clouds[:_RELATED].split(_BATCH))
     found = [estimator.predict_with_rivals(some[:, :count], module.num_points) for some in shown]
     chosen, rival = (concatenate(list(several)) for several in zip(*found, strict=True))
     if not estimator.two_ways.learn_twin(_object_poses(chosen), _object_poses(rival), chosen.margin):
         log.info("no decision between two explanations: fits tell them apart, or rivals differ from cloud to cloud")
         return
-    reliefs = [
-        estimator.reliefs(some[:, :count], module.num_points, some) for some in announced(log, "relief", batches)
-    ]
+    shown = announced(log, "two explanations, their relief", clouds.split(_BATCH))
+    reliefs = [estimator.reliefs(some[:, :count], module.num_points, some) for some in shown]
     if not estimator.two_ways.learn_decision(*(torch.cat(several) for several in zip(*reliefs, strict=True))):
         log.warning("too few clouds show all parts in both explanations: none is decided")
 
