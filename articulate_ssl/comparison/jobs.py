@@ -19,10 +19,11 @@ from articulate_ssl.baselines import METHODS
 from articulate_ssl.comparison.rows import needs_occupancy
 from articulate_ssl.metrics.report import JSON_NAME
 from articulate_ssl.pretrained.pack import PROFILES, VIEW_OF_DATA, fit_command, generate_arguments, newest_metrics
-from articulate_ssl.pretrained.rebuild import DEPTH_OPTIONS, resumed
+from articulate_ssl.pretrained.rebuild import COMPLETE_OPTIONS, DEPTH_OPTIONS, resumed
 from articulate_ssl.pretrained.stages import Stage, Workplace
 from articulate_ssl.training.checkpoint import load_module
 from datamodules.manifest import MANIFEST_NAME, Manifest, set_folder
+from datamodules.occupancy import FOLDER, INDEX_NAME
 
 DATA_SEED = 21  # no other: shipped weights and their check are of 11 and 12, README's numbers of 1 to 4
 OCCUPANCY_SAMPLES = 2048  # of each training cloud
@@ -84,12 +85,12 @@ def make_data(setting: Setting, learners: tuple[str, ...], say: Callable[[str], 
     folder = set_folder(setting.root, setting.category, "procedural", setting.view, protocol)
     occupancy = needs_occupancy(learners)
     if (folder / MANIFEST_NAME).is_file():
-        if not occupancy or (folder / "occupancy").is_dir():
+        if not occupancy or (folder / FOLDER / INDEX_NAME).is_file():
             return
         words = generate_arguments(Manifest.load(folder))
     else:
         words = ["--category", setting.category, "--view", setting.view, "--seed", str(DATA_SEED)]
-        words += DEPTH_OPTIONS if setting.view == "partial" else ()
+        words += DEPTH_OPTIONS if setting.view == "partial" else COMPLETE_OPTIONS
         words += setting.data_options
     words += ["--occupancy", str(OCCUPANCY_SAMPLES)] if occupancy else []
     command = (sys.executable, "-m", "render.generate", *words, "--out", str(setting.root), "--workers", "1")

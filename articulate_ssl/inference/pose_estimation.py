@@ -143,8 +143,10 @@ class Iteration:
     @property
     def _every(self) -> int:
         """Of the points of a part one in so many is compared."""
+        if self.compared is None:
+            return 1
         parts, shape_points = self.hypotheses.part_shape.shape[1:3]
-        return 1 if self.compared is None else max(1, parts * shape_points // self.compared)
+        return max(1, parts * shape_points // self.compared)
 
     @property
     def winner(self) -> Tensor:

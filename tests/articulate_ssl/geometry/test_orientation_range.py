@@ -65,7 +65,7 @@ def test_hypotheses_outside_the_range_win_only_where_there_is_no_other():
     points = torch.randn(2, 20, 3)
     base = se3(roma.rotvec_to_rotmat(torch.tensor([[0.0, 0, 3.0], [0, 0, 0.5], [0, 0, 1.0]])), torch.zeros(3, 3))
     posed = torch.stack([points, points + 0.1, points + 0.2], dim=1)[:, :, None]  # the first fits, but is turned round
-    hypotheses = SimpleNamespace(base=base.expand(2, 3, 4, 4), posed=lambda: posed)
+    hypotheses = SimpleNamespace(base=base.expand(2, 3, 4, 4), posed=lambda _every: posed)
 
     def leading(degrees):
         return Iteration(points, hypotheses, None, Observation(OrientationRange(degrees))).leading(3)

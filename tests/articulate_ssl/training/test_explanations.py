@@ -1,0 +1,85 @@
+"""From a module's own predictions to a decision between two explanations, and what the decision then changes."""
+
+import pytest
+import torch
+from tiny import POINTS, tiny_module
+
+from articulate_ssl.inference.relief import NUM_FEATURES
+from articulate_ssl.training import explanations
+from articulate_ssl.training.explanations import learn_two_ways
+
+
+@pytest.fixture
+def module():
+    return tiny_module().eval()
+
+
+@pytest.fixture
+def clouds() -> torch.Tensor:
+    """[6, 512, 3] of two boxes."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(6, 512, 3, generator=generator) * torch.tensor([0.6, 0.5, 0.2])
+    points[:, ::2, 2] += 0.3
+    return points - points.mean(dim=1, keepdim=True)
+
+
+def taught(module, weight: float) -> None:
+    """Each part where the other was; in favour of the explanation in which part 0 is longer, or, negative, shorter."""
+    module.two_ways.slot.copy_(torch.tensor([1, 0]))
+    module.two_ways.weight[2] = weight  # of the difference between the logarithms of part 0's lengths
+    module.two_ways.learnt.fill_(True)
+
+
+def test_few_clouds_teach_nothing_and_cost_nothing(module, clouds, monkeypatch):
+    monkeypatch.setattr(module.estimator, "predict_with_rivals", lambda *_: pytest.fail("predicted in vain"))
+    learn_two_ways(module, clouds)
+    assert not module.two_ways.learnt
+
+
+def test_an_object_with_one_explanation_gets_no_twin(module, clouds, monkeypatch):
+    monkeypatch.setattr(explanations, "FEWEST", 1)
+    learn_two_ways(module, clouds)  # too few for a relation: `two_ways` holds its own line
+    assert not module.two_ways.learnt
+
+
+def test_without_registration_or_dense_points_nothing_is_decided(module, clouds):
+    before = module.predict_points(clouds[:, :POINTS])
+    taught(module, 100.0)
+    after = module.predict_points(clouds[:, :POINTS])
+    torch.testing.assert_close(after.base_pose, before.base_pose, atol=0, rtol=0)
+    alone = module.predict_points(clouds[:, :POINTS], refine=False, dense=clouds)
+    torch.testing.assert_close(alone.margin, module.predict_points(clouds[:, :POINTS], refine=False).margin)
+
+
+def test_the_decision_chooses_one_of_the_same_two_explanations(module, clouds):
+    """Opposite preferences give opposite answers, the better explanation of one is the rival of the other."""
+    taught(module, 50.0)
+    longer = module.estimator.predict_with_rivals(clouds[:, :POINTS], POINTS, dense=clouds)
+    taught(module, -50.0)
+    shorter = module.estimator.predict_with_rivals(clouds[:, :POINTS], POINTS, dense=clouds)
+    decided = longer[0].margin > 0
+    assert decided.any()
+    torch.testing.assert_close(longer[0].base_pose[decided], shorter[1].base_pose[decided])
+    torch.testing.assert_close(longer[1].base_pose[decided], shorter[0].base_pose[decided])
+    torch.testing.assert_close(longer[0].margin, shorter[0].margin)
+
+
+def test_the_decision_is_part_of_the_weights(module):
+    taught(module, 3.0)
+    other = tiny_module()
+    other.load_state_dict(module.state_dict())
+    assert other.estimator.two_ways.learnt and other.estimator.two_ways.slot.tolist() == [1, 0]
+    assert len(other.two_ways.weight) == 2 * NUM_FEATURES
+
+
+def test_scans_are_decided_on_all_their_points(module, clouds):
+    taught(module, 50.0)
+    module.radius.follow(clouds[:, :POINTS], 0)
+    seen = []
+    decide = module.two_ways.log_odds
+    module.two_ways.log_odds = lambda one, other: seen.append(one) or decide(one, other)
+    scans = [cloud.double().numpy() * 7 + 1 for cloud in clouds[:2]]
+    estimates = module.predict_clouds(scans)
+    assert len(estimates) == len(seen) == 2
+    for estimate in estimates:
+        assert 0 <= float(estimate.prediction.margin) <= 1
