@@ -29,6 +29,11 @@ from articulate_ssl.geometry.se3 import invert_se3, se3
 _ALIKE = np.radians(25)  # rotations closer than this are the same twin
 # Of the clouds, that must have the same twin; and by how much their two explanations may differ in fit. Chosen.
 _COMMON, _CLOSE = 0.5, 0.25
+# Kurtosis of the difference between the fits of two explanations. Two clusters 1.55 standard deviations from their
+# middle have 2, and whoever goes by the better fit is right for 94 % of them: less needs no other decision. Measured:
+# laptops 2.9, washing machines, whose fit is hardly ever wrong, 1.6.
+_UNDECIDED = 2.0
+_OUTLYING = 4.0  # medians, beyond which a difference counts as this far
 _CENTERS = 100  # pairs that are tried as the most frequent relation
 FEWEST = 100  # clouds from which a decision is learnt
 _RIDGE = 0.3  # of discriminant analysis, in units of a standardised feature's variance
@@ -82,9 +87,14 @@ class TwoWays(nn.Module):
         rival: Tensor,  # [n, K, 4, 4] and of their rivals
         margin: Tensor,  # [n] `Prediction.margin`
     ) -> bool:
-        """Take the most frequent relation between explanations that fit alike. False, if there is none."""
+        """Take the most frequent relation between explanations that fit alike. False, if none is, or fits decide."""
         close = margin < _CLOSE
         if close.sum() < max(FEWEST, _COMMON * len(margin)):
+            return False
+        difference = -(1 - margin[close].double()).log()
+        difference = difference.clamp(max=_OUTLYING * difference.median())
+        if (kurtosis := _kurtosis(difference.cpu().numpy())) < _UNDECIDED:
+            log.info("fits part the two explanations themselves (kurtosis %.2f)", kurtosis)
             return False
         chosen, rival = chosen[close].double(), rival[close].double()
         # Whose twin is whose is open: both ways are examples.
