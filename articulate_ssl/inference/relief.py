@@ -33,7 +33,7 @@ def describe_relief(
     pivot: np.ndarray,  # [J, 3] of the joints that turn, among the points
     axis: np.ndarray,  # [J, 3] unit
 ) -> np.ndarray:  # [K * NUM_FEATURES]
-    """What the hypothesis says of every part; NaN for a part of fewer than 60 points.
+    """What the hypothesis says of every part; NaN for a part of fewer than 60 points, or of no thickness at all.
 
     Per part: logarithms of the extents, the share of the points, that of its upper half (along its thinnest axis), and
     per half: medians and upper quartiles of the roughness, heights, and along the middle axis counts and roughness.
@@ -70,6 +70,8 @@ def _part(points: np.ndarray, total: int, pose: np.ndarray, axes: np.ndarray) ->
     placed = _in_own_axes((points - pose[:3, 3]) @ pose[:3, :3] @ axes)
     low, high = np.percentile(placed, [1, 99], axis=0)
     upper = placed[:, 0] > (low[0] + high[0]) / 2
+    if not (high > low).all() or upper.all() or not upper.any():
+        return np.full(NUM_FEATURES, np.nan)
     where = np.clip((placed[:, 1] - low[1]) / (high[1] - low[1]) * _BINS, 0, _BINS - 1).astype(int)
     values = [*np.log(high - low + _LEAST), np.log(len(points) / total), upper.mean()]
     for half in (~upper, upper):

@@ -148,3 +148,11 @@ def test_a_lost_part_has_no_relief(generator):
     axes, nowhere = np.stack([np.eye(3)] * 2), np.zeros((0, 3))
     found = describe_relief(points, label, np.stack([np.eye(4)] * 2), axes, nowhere, nowhere)
     assert np.isnan(found[NUM_FEATURES:]).all() and np.isfinite(found[:NUM_FEATURES]).all()
+
+
+def test_what_has_no_thickness_has_no_relief():
+    points = np.zeros((100, 3))
+    points[:, :2] = np.random.default_rng(0).random((100, 2))
+    nowhere = np.zeros((0, 3))
+    found = describe_relief(points, np.zeros(100, dtype=int), np.eye(4)[None], np.eye(3)[None], nowhere, nowhere)
+    assert np.isnan(found).all()
