@@ -111,7 +111,8 @@ def test_data_are_made_once_and_occupancy_is_added_only_if_needed(tmp_path, prog
     setting = _setting(tmp_path, data_options=("--states", "6"))
     make_data(setting, ("oracle_icp",), print)
     (words,) = [" ".join(command) for command in programs.commands]
-    assert "--category laptop --view complete --seed 21 --states 6" in words and "--occupancy" not in words
+    assert "--category laptop --view complete --seed 21 " in words and "--occupancy" not in words
+    assert "--states 10 --rotations 1 --states 6 --out" in words  # the user's options have the last word
     made = Setting("laptop", "complete", tmp_path, synthetic_set.parents[1])
     make_data(made, ("oracle_icp",), print)
     assert len(programs.commands) == 1
