@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import leaky_relu, one_hot
 
-from articulate_ssl.baselines.method import OCCUPANCY, PART_LABELS, SEGMENTATION, Method, Problem
+from articulate_ssl.baselines.method import OCCUPANCY, PART_LABELS, SEGMENTATION, Method, Problem, no_joints
 from articulate_ssl.inference.prediction import Prediction
 from datamodules.articulated_data_module import ArticulatedDataModule
 
@@ -79,9 +79,6 @@ def segmentation(
     """Parts of points as a prediction that says nothing else: no motion, no shape, no joints (J = 0)."""
     clouds, _, num_parts = part_probability.shape
     identity = torch.eye(4, dtype=points.dtype, device=points.device)
-    none = points.new_zeros(clouds, 0)
-    index = torch.zeros(clouds, 0, dtype=torch.long, device=points.device)
-    vector = points.new_zeros(clouds, 0, 3)
     return Prediction(
         part_id=part_probability.argmax(-1),
         part_probability=part_probability,
@@ -89,16 +86,9 @@ def segmentation(
         part_shape=points.new_zeros(clouds, num_parts, 1, 3),
         assembly=points.new_zeros(clouds, num_parts, 3),
         base_pose=identity.expand(clouds, 4, 4),
-        joint_parent=index,
-        joint_child=index,
-        joint_type=index,
-        joint_axis=vector,
-        joint_pivot=vector,
-        joint_state=none,
-        canonical_axis=vector,
-        canonical_pivot=vector,
         reconstruction_error=points.new_zeros(clouds),
         margin=points.new_ones(clouds),
+        **no_joints(points),
     )
 
 

@@ -109,3 +109,22 @@ class Method(LightningModule):
             optimizer, lambda step: 0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * min(step / steps, 1)))
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+
+def no_joints(
+    points: Tensor,  # [B, N, 3]
+) -> dict[str, Tensor]:
+    """Every joint field of a prediction that says nothing of joints, J = 0."""
+    none = points.new_zeros(len(points), 0)
+    index = torch.zeros(len(points), 0, dtype=torch.long, device=points.device)
+    vector = points.new_zeros(len(points), 0, 3)
+    return {
+        "joint_parent": index,
+        "joint_child": index,
+        "joint_type": index,
+        "joint_axis": vector,
+        "joint_pivot": vector,
+        "joint_state": none,
+        "canonical_axis": vector,
+        "canonical_pivot": vector,
+    }

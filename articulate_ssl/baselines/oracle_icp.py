@@ -25,6 +25,7 @@ from articulate_ssl.baselines.method import (
     Effort,
     Method,
     Problem,
+    no_joints,
 )
 from articulate_ssl.baselines.perfect_oracle import part_points
 from articulate_ssl.geometry.rotation_group import rotation_group
@@ -198,7 +199,7 @@ class OracleICP(Method):
             base_pose=pose[:, 0],
             reconstruction_error=distance.amin(-1).mean(-1).to(points.dtype),
             margin=points.new_ones(len(points)),
-            **_no_joints(points),
+            **no_joints(points),
         )
 
 
@@ -222,23 +223,6 @@ def register_parts(
             best, _, shape[b, k] = min(results, key=lambda result: result[1])
             pose[b, k] = torch.from_numpy(best.copy())
     return pose, shape
-
-
-def _no_joints(points: Tensor) -> dict[str, Tensor]:
-    """Every joint field of a prediction for clouds [B, N, 3], with J = 0."""
-    none = points.new_zeros(len(points), 0)
-    index = torch.zeros(len(points), 0, dtype=torch.long)
-    vector = none[..., None].expand(-1, -1, 3)
-    return {
-        "joint_parent": index,
-        "joint_child": index,
-        "joint_type": index,
-        "joint_axis": vector,
-        "joint_pivot": vector,
-        "joint_state": none,
-        "canonical_axis": vector,
-        "canonical_pivot": vector,
-    }
 
 
 def choose_views(
