@@ -22,12 +22,12 @@ class LabelFreeReport:
     """Predicts every test cloud a second time, turned and of other points, and compares; `TestReport` without labels.
 
     Args:
-        predict: From points [B, N, 3] to a prediction.
+        predict: From points [B, N, 3], and the same clouds with all their points (`dense`), to a prediction.
         limited: Whether the network knows objects turned within a range only, as of a camera that is held upright; then
             clouds are tilted, not turned over.
     """
 
-    def __init__(self, predict: Callable[[Tensor], Prediction], limited: bool) -> None:
+    def __init__(self, predict: Callable[..., Prediction], limited: bool) -> None:
         self.metrics = LabelFreeMetrics()
         self.seconds = 0.0
         self._predict, self._limited = predict, limited
@@ -49,7 +49,9 @@ class LabelFreeReport:
         """Add a batch of test clouds that took `seconds` to predict."""
         again, turn = another_look(batch["dense_points"], self._limited, self._generator)
         points = batch["points"], again[:, : batch["points"].shape[1]]
-        self.metrics.update(prediction, self._predict(points[1]), points, turn, batch["instance"], probability)
+        self.metrics.update(
+            prediction, self._predict(points[1], dense=again), points, turn, batch["instance"], probability
+        )
         self.seconds += seconds
         self._clouds.append((batch["points"].cpu(), batch["sample"].cpu(), prediction.to("cpu")))
 
