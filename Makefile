@@ -3,7 +3,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup data preview test lint bench compare demo weights weights-check clean
+.PHONY: help setup data preview test lint bench bench-gpu compare demo weights weights-check clean
 
 PYTHON ?= python3
 CLUSTER ?=
@@ -76,6 +76,9 @@ lint: $(needs) ## Check style and formatting.
 
 bench: $(needs) ## Measure speed and memory: prints a table, writes build/bench.json. [ARGS="--device cuda"]
 	$(bin)/python -m articulate_ssl.benchmark $(ARGS)
+
+bench-gpu: $(needs) ## Measure training and prediction at the paper's size on all GPUs of this machine. [ARGS="--json build/gpu.json"]
+	$(bin)/python -m articulate_ssl.benchmark.paper_size $(ARGS)
 
 compare: $(needs) ## Train and test every method on the same clouds, can be interrupted: CAT=laptop or all [VIEW SEEDS METHODS="npcs_epn staged" ROOT OUT=build/compare WORKERS=1 ARGS].
 	$(bin)/python -m articulate_ssl.comparison --categories $(CAT) --view '$(VIEW)' --seeds '$(SEEDS)' $(if $(METHODS),--methods $(METHODS)) $(if $(ROOT),--root '$(ROOT)') $(if $(filter command,$(origin OUT)),--build '$(OUT)') $(if $(WORKERS),--workers '$(WORKERS)') $(ARGS)

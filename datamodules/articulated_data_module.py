@@ -12,7 +12,7 @@ import torch
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
-from datamodules.articulated_dataset import ArticulatedDataset, Batch, spread_subset
+from datamodules.articulated_dataset import ArticulatedDataset, Batch, clouds_of_objects, evenly, spread_subset
 from datamodules.manifest import MANIFEST_NAME, Manifest, ManifestError, set_folder
 from datamodules.samplers import EvaluationSampler, TrainingStream
 
@@ -191,12 +191,21 @@ class ArticulatedDataModule(LightningDataModule):
         dataset = ArticulatedDataset(folder, "train", options.num_points, rotate, verify=options.verify)
         return self._loader(dataset, EvaluationSampler(spread_subset(dataset.labels["instance"], samples)))
 
-    def discovery_dataloader(self, samples: int) -> DataLoader:
-        """Training clouds spread evenly over the split, chosen without looking at any label; as for calibration."""
+    def discovery_dataloader(self, samples: int, per_object: tuple[int, int] | None = None) -> DataLoader:
+        """Training clouds spread evenly over the split, chosen without looking at any label; as for calibration.
+
+        Args:
+            samples: How many.
+            per_object: Fewest and most clouds of an object, where clouds of the same objects are wanted
+                (`clouds_of_objects`). Which object a cloud shows is known from the recording; it is no label.
+        """
         dataset = ArticulatedDataset(
             self.folder, "train", self.hparams.num_points, self.manifest.view == "complete", verify=self.hparams.verify
         )
-        chosen = np.unique(np.linspace(0, len(dataset) - 1, min(samples, len(dataset))).round().astype(int))
+        if per_object is None:
+            chosen = evenly(np.arange(len(dataset)), samples)
+        else:
+            chosen = clouds_of_objects(dataset.labels["instance"], samples, *per_object)
         return self._loader(dataset, EvaluationSampler(np.random.default_rng(self.hparams.seed).permutation(chosen)))
 
     def on_before_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:

@@ -208,6 +208,35 @@ def spread_subset(
     return np.sort(np.concatenate(chosen))
 
 
+def evenly(
+    values: np.ndarray,  # [S]
+    size: int,
+) -> np.ndarray:  # [min(S, size)]
+    """A subset spread evenly over the stored order, both ends included."""
+    return values[np.unique(np.linspace(0, len(values) - 1, min(size, len(values))).round().astype(int))]
+
+
+def clouds_of_objects(
+    instance: np.ndarray,  # [S] instance of every sample
+    size: int,
+    fewest: int,
+    most: int,
+) -> np.ndarray:  # [min(S, size)] ascending sample indices, more if a single object has more
+    """Clouds of as many objects as fit, each with all of its clouds or `most` of them, objects spread evenly.
+
+    Objects that have fewer than `fewest` clouds, and clouds beyond `most`, come in only where room is left.
+    """
+    members = [np.flatnonzero(instance == i) for i in np.unique(instance)]
+    whole = [evenly(m, most) for m in members if len(m) >= fewest]
+    chosen = np.zeros(0, dtype=np.int64)
+    for count in range(len(whole), 0, -1):
+        chosen = np.concatenate([whole[i] for i in evenly(np.arange(len(whole)), count)])
+        if len(chosen) <= size:
+            break
+    others = np.setdiff1d(np.arange(len(instance)), chosen)
+    return np.sort(np.concatenate([chosen, evenly(others, max(0, size - len(chosen)))]))
+
+
 def _widen(array: np.ndarray) -> np.ndarray:
     """Integers as int64, torch's index type; floats as they are."""
     return array if array.dtype.kind == "f" else array.astype(np.int64)

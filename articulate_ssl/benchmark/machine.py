@@ -43,30 +43,36 @@ class Machine:
 
     def seconds(self, function: Callable[[], object]) -> float:
         """Wall-clock seconds of one call."""
-        self._synchronize()
-        start = time.perf_counter()
+        start = self.time()
         function()
-        self._synchronize()
-        return time.perf_counter() - start
+        return self.time() - start
+
+    def time(self) -> float:
+        """The clock, once the device has done all that it was given."""
+        if self.on_gpu:
+            torch.cuda.synchronize()
+        return time.perf_counter()
 
     def peak_bytes(self, function: Callable[[], object]) -> float:
         """Largest memory during one call, beyond what was held before it (Linux or CUDA)."""
+        before = self.forget_peak()
+        function()
+        return self.peak() - before
+
+    def forget_peak(self) -> float:
+        """Bytes that are held now; `peak` is the largest number from here on."""
         gc.collect()
         if self.on_gpu:
             torch.cuda.empty_cache()
             torch.cuda.reset_peak_memory_stats()
-            before = torch.cuda.memory_allocated()
-            function()
-            return torch.cuda.max_memory_allocated() - before
+            return torch.cuda.memory_allocated()
         ctypes.CDLL(None).malloc_trim(0)  # memory that malloc keeps for later would hide what the call needs
         Path("/proc/self/clear_refs").write_text("5")  # resets the high-water mark
-        before = _status_bytes("VmRSS")
-        function()
-        return _status_bytes("VmHWM") - before
+        return _status_bytes("VmRSS")
 
-    def _synchronize(self) -> None:
-        if self.on_gpu:
-            torch.cuda.synchronize()
+    def peak(self) -> float:
+        """Bytes."""
+        return torch.cuda.max_memory_allocated() if self.on_gpu else _status_bytes("VmHWM")
 
 
 def _status_bytes(field: str) -> float:

@@ -22,11 +22,10 @@ TEST_BATCH = 8  # of the configurations: what `lightning test` holds in memory a
 def whole_network(machine: Machine) -> list[Result]:
     """Training step and inference of the whole network, at paper size and at that of the cpu profile."""
     results = [_training_step_of_cpu_profile(machine)]
-    module = build_module(machine, NetworkOptions()).eval()
-    results += _inference_of_one_cloud(machine, module)
+    results += inference(machine, build_module(machine, NetworkOptions()).eval())
     for name in ("separable", "directions"):
         results += _cheaper_inference_of_one_cloud(machine, name)
-    return [*results, _inference_of_many_clouds(machine, module), *_training_step_at_paper_size(machine)]
+    return [*results, *_training_step_at_paper_size(machine)]
 
 
 def _training_step_of_cpu_profile(machine: Machine) -> Result:
@@ -38,30 +37,34 @@ def _training_step_of_cpu_profile(machine: Machine) -> Result:
     return Result("train_step_s_cpu_profile", label, [machine.seconds(step) for _ in range(7)], "s")
 
 
-def _inference(machine: Machine, module: ArticulatedPoseModule, clouds: int) -> Callable[[], None]:
-    points = random_clouds(machine, clouds, 512)
+def inference(machine: Machine, module: ArticulatedPoseModule) -> list[Result]:
+    """Prediction without registration, of one cloud and of 64."""
+    return [*_inference_of_one_cloud(machine, module), *_inference_of_many_clouds(machine, module)]
+
+
+def _predict(machine: Machine, module: ArticulatedPoseModule, clouds: int) -> Callable[[], None]:
+    points = random_clouds(machine, clouds, module.num_points)
     batches = points.split(clouds if machine.on_gpu else TEST_BATCH)
 
     def run() -> None:
-        with machine.autocast():
-            for batch in batches:
-                module.predict_points(batch, refine=False)
+        for batch in batches:
+            module.predict_points(batch, refine=False)
 
     return run
 
 
 def _inference_of_one_cloud(machine: Machine, module: ArticulatedPoseModule) -> list[Result]:
-    run = _inference(machine, module, 1)
+    run = _predict(machine, module, 1)
     run()
     rates = [1 / machine.seconds(run) for _ in range(20 if machine.on_gpu else 3)]
     return [
         Result("inference_clouds_per_s_b1", "inference, paper size, batch 1", rates, "/s"),
-        Result(None, "  peak memory", [machine.peak_bytes(run) / 1e9], "GB"),
+        Result("inference_gb_b1", "  peak memory", [machine.peak_bytes(run) / 1e9], "GB"),
     ]
 
 
 def _cheaper_inference_of_one_cloud(machine: Machine, name: str) -> list[Result]:
-    run = _inference(machine, build_module(machine, NetworkOptions(**{name: True})).eval(), 1)
+    run = _predict(machine, build_module(machine, NetworkOptions(**{name: True})).eval(), 1)
     run()
     rates = [1 / machine.seconds(run) for _ in range(20 if machine.on_gpu else 5)]
     return [
@@ -70,12 +73,15 @@ def _cheaper_inference_of_one_cloud(machine: Machine, name: str) -> list[Result]
     ]
 
 
-def _inference_of_many_clouds(machine: Machine, module: ArticulatedPoseModule) -> Result:
-    run = _inference(machine, module, 64)
+def _inference_of_many_clouds(machine: Machine, module: ArticulatedPoseModule) -> list[Result]:
+    run = _predict(machine, module, 64)
     if machine.on_gpu:
         run()
     rates = [64 / machine.seconds(run) for _ in range(5 if machine.on_gpu else 1)]
-    return Result("inference_clouds_per_s_b64", "inference, paper size, 64 clouds", rates, "/s")
+    results = [Result("inference_clouds_per_s_b64", "inference, paper size, 64 clouds", rates, "/s")]
+    if machine.on_gpu:
+        results.append(Result("inference_gb_b64", "  peak memory", [machine.peak_bytes(run) / 1e9], "GB"))
+    return results
 
 
 def _training_step_at_paper_size(machine: Machine) -> list[Result]:

@@ -153,6 +153,7 @@ class Job:
         fit, _ = self.stages()
         module = load_module(whole["checkpoint"])
         about = {"parameters": sum(p.numel() for p in module.parameters()), "train_seconds": self.work.seconds(fit)}
+        about |= {name: whole[name] for name in ("setting",) if name in whole}
         return {"part_names": whole["part_names"], **whole["columns"][column], **about}
 
     @property

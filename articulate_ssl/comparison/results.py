@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from statistics import fmean
@@ -15,6 +15,7 @@ from articulate_ssl.comparison.jobs import Job, Setting
 from articulate_ssl.comparison.rows import Row, rows_of
 from articulate_ssl.comparison.statistics import Estimate, combined
 from articulate_ssl.geometry.screw import REVOLUTE
+from articulate_ssl.metrics.report import MULTI_STATE
 from articulate_ssl.metrics.report import rows as statistics_of
 from articulate_ssl.training.columns import NETWORK
 
@@ -23,6 +24,7 @@ ALL = "all"  # parts or joints on average
 _NO_REPORT = {"part_names": (), "samples": 0, "instances": 0, "calibration": {"joint_type": ()}}
 # Of our rows, the one that does what the paper's own does.
 _PAPERS_OWN = ("paper", f"paper_{NETWORK}")
+_OBJECTS = "which clouds show one object"  # given in training, where that is the multi-state setting
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,8 @@ def _row_result(row: Row, seeds: tuple[int, ...], reports: list[dict[str, Any]],
     printed = _printed(row, setting)
     if not reports:
         return RowResult(row, printed=printed)
+    if any(report.get("setting") == MULTI_STATE for report in reports):
+        row = replace(row, given=(*row.given, _OBJECTS))
     each = [{(quantity, of): value for quantity, of, value in statistics_of(report)} for report in reports]
     values = {key: combined([one[key] for one in each]) for key in each[0] if key[0] in row.quantities}
     return RowResult(

@@ -20,22 +20,18 @@ import logging
 from collections.abc import Iterator
 from dataclasses import replace
 
-import torch
 from torch import Tensor
 
 from articulate_ssl.discovery.bodies import fit_bodies
-from articulate_ssl.discovery.common_frame import common_frame
+from articulate_ssl.discovery.collection import Collection
 from articulate_ssl.discovery.instance_fit import InstanceFit
 from articulate_ssl.discovery.joint_fit import fit_joints
 from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.discovery.proposals import Scene, load_proposals
 from articulate_ssl.discovery.references import aligned_to, alike, choose_references
 from articulate_ssl.discovery.registered_shape import RegisteredShape, trimmed_mean
-from articulate_ssl.discovery.registrar import Registrar, SearchingRegistrar, SlidingRegistrar
+from articulate_ssl.discovery.registrar import Registrar
 from articulate_ssl.discovery.selection import select
-from articulate_ssl.geometry.rotation_group import rotation_group
-from articulate_ssl.geometry.screw import PRISMATIC
-from articulate_ssl.geometry.se3 import se3
 from articulate_ssl.ops.progress import Stage, announce
 from articulate_ssl.shape.observation import Observation
 
@@ -58,32 +54,23 @@ def discover(
     Raises:
         DiscoveryError: if no split into `num_parts` moving parts survives.
     """
-    generator = torch.Generator().manual_seed(options.seed)
-    # Sliding says nothing about orientation, while free registration of what slides turns it wherever it likes.
-    slides = joint_type == PRISMATIC and not observation.orientation.limited
-    frame = common_frame(clouds, generator) if slides else None
-    clouds = clouds[:, : options.dense_points].contiguous()
-    rotations = rotation_group(60).elements.to(clouds)
-    rotations = rotations[observation.orientation.contains(rotations)]
-    if frame is not None:
-        clouds, registrar = clouds @ frame.mT, SlidingRegistrar(options, generator)
-    else:
-        registrar = SearchingRegistrar(options, generator, rotations, observation)
-    few = clouds[:: max(1, len(clouds) // options.search_clouds)][: options.search_clouds]
+    collection = Collection.of(clouds, joint_type, options, observation)
+    clouds, few, framed = collection.clouds, collection.few, collection.frame is not None
     references = clouds[choose_references(clouds, options.references)]
     aligned = (
-        aligned_to(one, few, rotations, options) if frame is None else alike(one, few, options)
+        alike(one, few, options) if framed else aligned_to(one, few, collection.rotations, options)
         for one in _announced(references, options)
     )
     scenes = (
-        Scene(one, others, num_parts, joint_type, options, observation, generator, frame is not None)
+        Scene(one, others, num_parts, joint_type, options, observation, collection.registrar.generator, framed)
         for one, others in zip(references, aligned, strict=True)
     )
-    found = _rounds(_best_reference(scenes, few, registrar, num_parts), clouds, few, registrar)
+    found = _best_reference(scenes, few, collection.registrar, num_parts)
+    found = _rounds(found, clouds, few, collection.registrar)
     if len(found.error) < len(clouds):
-        found = registrar.register(found, clouds)
+        found = collection.registrar.register(found, clouds)
     _announce(_stages(options), options, "done")
-    return found if frame is None else replace(found, base=se3(frame.mT, frame.new_zeros(3)) @ found.base)
+    return collection.as_given(found)
 
 
 def _best_reference(scenes: Iterator[Scene], few: Tensor, registrar: Registrar, num_parts: int) -> RegisteredShape:

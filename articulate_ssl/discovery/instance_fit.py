@@ -161,9 +161,18 @@ class InstanceFit:
 
     def maps(self) -> PartMaps:
         """Of every part, from the template to each cloud: stretched, then articulated and posed."""
-        stretch = stretch_matrices(self._axes, self.log_stretch)
-        rest, pivots = hinged(stretch, self._center, self._joints())
-        return rest.then(replace(self._joints(), pivot=pivots).part_pose(self.base, self._state))
+        rest, joints = self._stretched()
+        return rest.then(joints.part_pose(self.base, self._state))
+
+    def instances(self) -> ArticulatedShape:
+        """The clouds' own shapes [n, T, 3] and joints, in canonical object space at joint states zero."""
+        rest, joints = self._stretched()
+        return replace(self._shape, points=rest.move(self._shape.points, self._shape.label), joints=joints)
+
+    def _stretched(self) -> tuple[PartMaps, Joints]:
+        """From the template to each cloud's own shape, and that shape's joints."""
+        rest, pivots = hinged(stretch_matrices(self._axes, self.log_stretch), self._center, self._joints())
+        return rest, replace(self._joints(), pivot=pivots)
 
     def _joints(self) -> Joints:
         axis = functional.normalize(self._axis, dim=-1)

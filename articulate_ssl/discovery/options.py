@@ -28,6 +28,8 @@ class DiscoveryOptions:
         keep: Share of the clouds, best fitted first, that labels and joints are solved from.
         min_share: Splits with a part smaller than this share of the template are discarded.
         seed: Of the random splits.
+        grouped: The multi-state setting: which clouds show the same object is known, and templates are whole objects
+            (`discovery.grouped`). An easier problem than the paper's, which sees single clouds.
     """
 
     clouds: int = 192
@@ -45,6 +47,7 @@ class DiscoveryOptions:
     keep: float = 0.75
     min_share: float = 0.05
     seed: int = 0
+    grouped: bool = False
 
     @property
     def few_cycles(self) -> int:

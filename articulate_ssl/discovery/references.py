@@ -23,10 +23,34 @@ def choose_references(clouds: Tensor, count: int) -> Tensor:
 
     These are invariant to rotation, and tell an open object from a closed one.
     """
-    radius = (clouds - clouds.mean(dim=1, keepdim=True)).norm(dim=-1).sort(dim=1).values
-    distance = torch.cdist(radius, radius, p=1)
+    return _medoids(_sorted_radii(clouds), count)
+
+
+def choose_objects(
+    clouds: Tensor,  # [n, N, 3]
+    instance: Tensor,  # [n] which object each cloud shows
+    count: int,
+    fewest: int,
+) -> Tensor:
+    """Which objects are typical by the same measure, in the mean over their clouds, of those with `fewest` clouds."""
+    objects, clouds_of = instance.unique(return_counts=True)
+    objects = objects[clouds_of >= fewest]
+    if not len(objects):
+        return objects
+    radii = _sorted_radii(clouds)
+    means = torch.stack([radii[instance == one].mean(dim=0) for one in objects])
+    return objects[_medoids(means, min(count, len(objects)))]
+
+
+def _sorted_radii(clouds: Tensor) -> Tensor:
+    return (clouds - clouds.mean(dim=1, keepdim=True)).norm(dim=-1).sort(dim=1).values
+
+
+def _medoids(radii: Tensor, count: int) -> Tensor:
+    """Indices of the medoids of `count` clusters."""
+    distance = torch.cdist(radii, radii, p=1)
     # The first is the most typical of all, the others are ever less so.
-    medoids = distance.sum(dim=1).argsort()[torch.linspace(0, len(clouds) - 1, count).long()]
+    medoids = distance.sum(dim=1).argsort()[torch.linspace(0, len(radii) - 1, count).long()]
     for _ in range(_ROUNDS):
         nearest = distance[medoids].argmin(dim=0)
         clusters = [(nearest == k).nonzero().squeeze(-1) for k in range(count)]

@@ -13,6 +13,7 @@ from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.discovery.registered_shape import RegisteredShape
 from articulate_ssl.discovery.search import search_articulated
 from articulate_ssl.discovery.slide_table import place
+from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.observation import Observation
 
 _STATE_STARTS = 1.5  # standard deviations of the states, on either side of their middle, from which a search starts
@@ -74,18 +75,37 @@ class SlidingRegistrar(Registrar):
     """In a common frame, parts that slide along one of its axes: their places are read off, then stretched."""
 
     def register(self, found: RegisteredShape, clouds: Tensor) -> RegisteredShape:
-        """Place, stretch the candidates, choose, stretch the chosen for longer."""
-        few_cycles, shape = self.options.few_cycles, found.limited()
-        placed = place(found.shape, clouds, self.options.points)
-        copies = clouds.repeat_interleave(placed.base.shape[1], dim=0)
-        base, state, log_stretch = (value.flatten(0, 1) for value in placed)
-        fit = InstanceFit(shape, base, state, self.generator, found.axes, log_stretch)
-        fit.optimise(copies, few_cycles, shared=False)
-        best = fit.error(copies, softened=False).unflatten(0, placed.base.shape[:2]).argmin(dim=1)
-        base, state, log_stretch = (_chosen(value, best) for value in (fit.base, fit.state, fit.log_stretch))
-        fit = InstanceFit(shape, base, state, self.generator, found.axes, log_stretch)
-        fit.optimise(clouds, 2 * few_cycles, shared=False)
+        """See `fit_slides`."""
+        options = self.options
+        fit = fit_slides(found.limited(), found.axes, clouds, options.points, options.few_cycles, self.generator)
         return replace(RegisteredShape.of(fit, clouds), shape=found.shape)
+
+
+def fit_slides(
+    shape: ArticulatedShape,
+    axes: Tensor,  # [K, 3, 3] columns along which parts stretch
+    clouds: Tensor,  # [n, N, 3] in a frame common to them and the shape
+    num_points: int,
+    cycles: int,
+    generator: torch.Generator,
+) -> InstanceFit:
+    """Place a shape whose parts slide, stretch the candidates, choose, stretch the chosen for longer.
+
+    Args:
+        num_points: Of the shape, whose offsets are tried.
+        cycles: Of the descent on candidates; twice as many on the chosen.
+        generator: Of the points that are drawn in it.
+    """
+    placed = place(shape, clouds, num_points)
+    copies = clouds.repeat_interleave(placed.base.shape[1], dim=0)
+    base, state, log_stretch = (value.flatten(0, 1) for value in placed)
+    fit = InstanceFit(shape, base, state, generator, axes, log_stretch)
+    fit.optimise(copies, cycles, shared=False)
+    best = fit.error(copies, softened=False).unflatten(0, placed.base.shape[:2]).argmin(dim=1)
+    base, state, log_stretch = (_chosen(value, best) for value in (fit.base, fit.state, fit.log_stretch))
+    fit = InstanceFit(shape, base, state, generator, axes, log_stretch)
+    fit.optimise(clouds, 2 * cycles, shared=False)
+    return fit
 
 
 def _chosen(candidates: Tensor, best: Tensor) -> Tensor:

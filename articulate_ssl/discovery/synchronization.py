@@ -14,7 +14,7 @@ from articulate_ssl.discovery.distance_field import DistanceFields
 from articulate_ssl.geometry.rotation_group import RotationGroup
 
 _POINTS = 512  # of a cloud, compared with the field of another
-_CAP = 0.1  # distances beyond count as this, in widths of the unit box
+CAP = 0.1  # distances beyond count as this, in widths of the unit box
 _STARTS, _SWEEPS = 24, 30
 
 
@@ -37,7 +37,7 @@ def pairwise_costs(
     """Capped Chamfer distance between cloud i and cloud j turned by each element."""
     fields = DistanceFields.of(clouds)
     turned = torch.einsum("gij,npj->ngpi", group.elements.to(clouds), clouds[:, :_POINTS])
-    one_sided = torch.stack([fields.at(i, turned).clamp(max=_CAP).mean(dim=-1) for i in range(len(clouds))])
+    one_sided = torch.stack([fields.at(i, turned).clamp(max=CAP).mean(dim=-1) for i in range(len(clouds))])
     return one_sided + one_sided.transpose(0, 1)[..., group.inverse]
 
 

@@ -5,6 +5,7 @@
    cloud in the part frames of the last winner (paper, Sec. 3.1).
 3. *Registration* at test time: the leading hypotheses' predicted shapes are registered to the cloud without leaving
    their joints, and the best reconstruction wins.
+   Where parts slide, the category's own shape is looked for, too, in the frame of the cloud (`sliding_search`).
 4. *Decision*, where a category's clouds can be explained in two ways that fit alike: the winner's twin is registered,
    too, and the relief of all points decides (`two_ways`).
 
@@ -14,8 +15,8 @@ Training takes the first two steps too; nothing here knows a loss or an optimise
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,19 +24,21 @@ import roma
 import torch
 from torch import Tensor
 
-from articulate_ssl.discovery.registration import register_articulated
+from articulate_ssl.discovery.registration import chamfer_l1, register_articulated
 from articulate_ssl.discovery.search import search_articulated
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
 from articulate_ssl.inference.confidence import relative_error
 from articulate_ssl.inference.point_cloud_io import normalise_cloud
-from articulate_ssl.inference.prediction import Prediction, ScanEstimate
+from articulate_ssl.inference.prediction import Prediction, ScanEstimate, concatenate
 from articulate_ssl.inference.relief import NUM_FEATURES, describe_relief
+from articulate_ssl.inference.sliding_search import SlidingSearch
 from articulate_ssl.inference.two_ways import TwoWays
 from articulate_ssl.losses.reconstruction import distances_to_parts
 from articulate_ssl.network.articulated_network import ArticulatedNetwork
-from articulate_ssl.network.hypotheses import Hypotheses
+from articulate_ssl.network.heads.shape import CanonicalShape
+from articulate_ssl.network.hypotheses import Hypotheses, either
 from articulate_ssl.network.rigid_alignment import RigidAlignment
 from articulate_ssl.ops.chamfer import chamfer, hypothesis_distances, nearest_distance
 from articulate_ssl.ops.kd_tree import kd_tree
@@ -47,7 +50,7 @@ _ANOTHER_WAY = math.radians(30)  # beyond, one of two hypotheses is wrong (`metr
 _SCALE_STARTS = (-1.5, -0.75, 0.0, 0.75, 1.5)
 _SIDE = 1 / 3  # of the width of a joint's range, from its middle, where a search without a network starts, too
 _AGREEING_POINTS = 64  # of a cloud, farthest-point order: which way round its parts are shows in few
-_RELIEF_POINTS = 4096  # of a scan: as many as a generated cloud has
+_DENSE_POINTS = 4096  # of a scan: as many as a generated cloud has
 _SCANS_AT_ONCE = 16  # bounds the memory; each is a cloud per start
 
 
@@ -163,6 +166,32 @@ class Iteration:
         return self.observation.ranked(self.distance, self.hypotheses.base[..., :3, :3])
 
 
+@dataclass(frozen=True)
+class Candidates:
+    """Explanations of clouds, among which one is chosen.
+
+    Attributes:
+        error: [B, C] of each.
+        base: [B, C, 4, 4] base poses.
+        select: One of each cloud, by its index [B], as H = 1.
+    """
+
+    error: Tensor
+    base: Tensor
+    select: Callable[[Tensor], Hypotheses]
+
+    def beside(self, other: Candidates) -> Candidates:
+        """These, and others behind them."""
+        count = self.error.shape[1]
+
+        def select(index: Tensor) -> Hypotheses:
+            mine, others = self.select(index.clamp(max=count - 1)), other.select((index - count).clamp(min=0))
+            return either(index < count, mine, others)
+
+        error, base = torch.cat([self.error, other.error], dim=1), torch.cat([self.base, other.base], dim=1)
+        return Candidates(error, base, select)
+
+
 class PoseEstimator:
     """Pose estimation with the networks of a module, which owns them, trains them and saves them.
 
@@ -177,6 +206,7 @@ class PoseEstimator:
     Attributes:
         agreement, compared: See `Iteration`; recipes may set them.
         two_ways: The decision between explanations that fit alike, if one was learnt; a module owns it.
+        sliding: The search for parts that slide, if one was learnt; a module owns it.
     """
 
     agreement: float = 0.0
@@ -194,6 +224,7 @@ class PoseEstimator:
         self.articulated, self.rigid, self.iterations = articulated, rigid, iterations
         self.observation, self.posterior_scale, self.inference = observation, posterior_scale, inference
         self.two_ways = TwoWays(articulated.num_parts, articulated.num_parts * NUM_FEATURES)
+        self.sliding = SlidingSearch(*articulated.category.template.shape[:2])
 
     def align(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Stage 0: clouds turned roughly to canonical orientation [B, N, 3], and the pose [B, 4, 4] that undoes it."""
@@ -255,8 +286,9 @@ class PoseEstimator:
         Args:
             num_points: The networks read this many leading points; registration reads all.
             refine: Register at test time, or not; None does what the options say.
-            dense: What a decision between two explanations reads, an even sample of the surface and about as many
-                points as in training; without them, and without registration, none is made.
+            dense: What a decision between two explanations and a search for sliding parts read, an even sample of the
+                surface and about as many points as in training; without them, and without registration, there is
+                neither.
 
         Raises:
             ValueError: if a cloud has NaN or infinite points.
@@ -280,17 +312,24 @@ class PoseEstimator:
             raise ValueError("a cloud has NaN or infinite points")
         with torch.autocast(points.device.type, enabled=False):
             registers = (self.inference.refine if refine is None else refine) is not False
-            candidates, error = self._candidates(points, num_points, registers)
-            rotation = candidates.base[..., :3, :3]
-            best = self.observation.ranked(error, rotation).argmin(dim=1)
-            rival, margin = rivals(error, candidates.base, best, self.observation.orientation.contains(rotation))
-            chosen, other = candidates.select(best), candidates.select(rival)
+            candidates = self._candidates(points, num_points, registers)
+            if registers and dense is not None and self.sliding.learnt:
+                candidates = candidates.beside(self._slid(points, dense))
+            chosen, other, margin = self._best(candidates)
             if registers and dense is not None and self.two_ways.learnt:
                 twin = self._twin(chosen, points)
                 odds = self.two_ways.log_odds(self._relief(chosen, dense), self._relief(twin, dense))
-                chosen, other = _exchanged(chosen, twin, odds < 0)
+                chosen, other = either(odds < 0, twin, chosen), either(odds < 0, chosen, twin)
                 margin = (odds.abs() / 2).tanh()  # how much likelier than not
             return self._prediction(chosen, points, margin), self._prediction(other, points, torch.zeros_like(margin))
+
+    def _best(self, candidates: Candidates) -> tuple[Hypotheses, Hypotheses, Tensor]:
+        """The best candidate of every cloud, its rival, and the margin between them [B]."""
+        rotation = candidates.base[..., :3, :3]
+        best = self.observation.ranked(candidates.error, rotation).argmin(dim=1)
+        allowed = self.observation.orientation.contains(rotation)
+        rival, margin = rivals(candidates.error, candidates.base, best, allowed)
+        return candidates.select(best), candidates.select(rival), margin
 
     @torch.no_grad()
     def reliefs(
@@ -300,19 +339,46 @@ class PoseEstimator:
         dense: Tensor,  # [B, P, 3] the same clouds with all their points
     ) -> tuple[Tensor, Tensor]:  # [B, F], [B, F]
         """The relief of predictions and of their twins, from which `two_ways` learns to decide."""
-        candidates, error = self._candidates(points, num_points, registers=True)
-        chosen = candidates.select(self.observation.ranked(error, candidates.base[..., :3, :3]).argmin(dim=1))
+        chosen, _, _ = self._best(self._candidates(points, num_points, registers=True))
         return self._relief(chosen, dense), self._relief(self._twin(chosen, points), dense)
 
-    def _candidates(self, points: Tensor, num_points: int, registers: bool) -> tuple[Hypotheses, Tensor]:
-        """Among which a prediction is chosen, in the frame of the points, and their errors [B, H]."""
+    def _candidates(self, points: Tensor, num_points: int, registers: bool) -> Candidates:
+        """The network's hypotheses, or the leading ones registered, in the frame of the points."""
         aligned, pose = self.align(points[:, :num_points])
         *_, last = self.iterate(aligned)
         if registers:
             candidates, error = self._refine(last, transform_points(invert_se3(pose), points))
         else:
             candidates, error = last.hypotheses, last.distance
-        return candidates.at(pose[:, None] @ candidates.base, candidates.state), error
+        candidates = candidates.at(pose[:, None] @ candidates.base, candidates.state)
+        return Candidates(error, candidates.base, candidates.select)
+
+    def _slid(
+        self,
+        points: Tensor,  # [B, N, 3]
+        dense: Tensor,  # [B, P, 3]
+    ) -> Candidates:
+        """The category's shape where the search for sliding parts finds it, at the clouds' own proportions."""
+        articulated, size = self.articulated, points.shape[:1]
+        shape, base, state = self.sliding.search(articulated.category.chain(), dense)
+        count = base.shape[1]
+        posed = shape.posed(base.flatten(0, 1), state.flatten(0, 1))
+        copies = points.repeat_interleave(count, dim=0)
+        error = chamfer_l1(copies, posed, self.observation.bidirectional).unflatten(0, (*size, count))
+        parts = shape.points.unflatten(1, (articulated.num_parts, -1))
+        rows = torch.arange(*size, device=points.device)
+
+        def select(index: Tensor) -> Hypotheses:
+            own = rows * count + index
+            center = parts[own].mean(dim=2)
+            found = articulated.category_at(base[rows, index, None], state[rows, index, None])
+            structure = replace(
+                found.structure, pivot=shape.joints.pivot[own], axis=shape.joints.axis.expand(*size, 1, -1, -1)
+            )
+            shapes = CanonicalShape(parts[own] - center[:, :, None], center)
+            return replace(found, shape=shapes, structure=structure)
+
+        return Candidates(error, base, select)
 
     def _twin(
         self,
@@ -351,14 +417,18 @@ class PoseEstimator:
         self,
         points: Tensor,  # [B, N, 3] normalised, farthest-point order
         state_range: Tensor,  # [J, 2] lowest and highest joint state in training
+        dense: Tensor | None = None,  # [B, P, 3] the same clouds with all their points
     ) -> Prediction:
         """Predictions of the category's shape and joints alone: no network has a say.
 
         They are searched (`search_articulated`) from the 60 rotations of the icosahedron, those within the orientation
         range, and from joints in the middle of their range and, in every combination, at either side of it; 3 states
-        for one joint.
+        for one joint. Where parts slide, `sliding_search` takes the place of that, if there are dense clouds.
         """
         with torch.autocast(points.device.type, enabled=False):
+            if dense is not None and self.sliding.learnt:
+                found, _, margin = self._best(self._slid(points, dense))
+                return self._prediction(found, points, margin)
             low, high = state_range.to(points).unbind(-1)
             middle, side = (low + high) / 2, _SIDE * (high - low)
             sides = torch.cartesian_prod(*torch.stack([middle - side, middle + side], dim=-1)).view(-1, len(middle))
@@ -366,11 +436,8 @@ class PoseEstimator:
             rotations = rotations[self.observation.orientation.contains(rotations)]
             shape = self.articulated.category.articulated_shape(self.articulated.joint_type)
             base, state, error = search_articulated(shape, points, rotations, torch.cat([middle[None], sides]))
-            rotation = base[..., :3, :3]
-            best = self.observation.ranked(error, rotation).argmin(dim=1)
-            allowed = self.observation.orientation.contains(rotation)
-            _, margin = rivals(error, base, best, allowed)
-            found = self.articulated.category_at(base, state).select(best)
+            candidates = Candidates(error, base, self.articulated.category_at(base, state).select)
+            found, _, margin = self._best(candidates)
             return self._prediction(found, points, margin)
 
     def predict_scans(
@@ -412,7 +479,15 @@ class PoseEstimator:
             scales.append([size / start for start in starts])
             tried += [torch.as_tensor(cloud / scale, dtype=torch.float32) for scale in scales[-1]]
         batch = torch.stack(tried).to(device)
-        prediction, rival = self.predict_with_rivals(batch, num_points, refine)
+        if self.sliding.learnt:
+            every = zip(clouds, centers, scales, batch.split(len(starts)), strict=True)
+            found = [
+                self.predict_with_rivals(some, num_points, refine, _scaled(points, center, scale).to(batch))
+                for points, center, scale, some in every
+            ]
+            prediction, rival = (concatenate(list(several)) for several in zip(*found, strict=True))
+        else:
+            prediction, rival = self.predict_with_rivals(batch, num_points, refine)
         best = relative_error(prediction, batch).view(-1, len(starts)).argmin(dim=1)
         rows = torch.arange(len(clouds), device=best.device) * len(starts) + best
         batch, prediction, rival = batch[rows], prediction[rows], rival[rows]
@@ -421,8 +496,8 @@ class PoseEstimator:
         for i, (points, center, scale) in enumerate(zip(clouds, centers, scales, strict=True)):
             one, other = prediction[i : i + 1], rival[i : i + 1]
             if self.two_ways.learnt:
-                dense = _drawn((np.asarray(points) - center) / scale).to(batch)
-                one, other = self.predict_with_rivals(batch[i : i + 1], num_points, refine, dense[None])
+                dense = _scaled(points, center, [scale]).to(batch)
+                one, other = self.predict_with_rivals(batch[i : i + 1], num_points, refine, dense)
             other = other if one.margin < 1 else None
             estimates.append(ScanEstimate(one, other, batch[i].cpu().numpy(), center, scale))
         return estimates
@@ -477,15 +552,12 @@ def _joint_lines(
     return axis, transform_points(parent_pose, one.pivot[:, :, None])[:, :, 0]
 
 
-def _exchanged(one: Hypotheses, other: Hypotheses, where: Tensor) -> tuple[Hypotheses, Hypotheses]:
-    """Two explanations of the same clouds (H = 1), exchanged for some clouds [B]."""
-    where = where[:, None, None]
-    base = torch.where(where[..., None], other.base, one.base), torch.where(where[..., None], one.base, other.base)
-    state = torch.where(where, other.state, one.state), torch.where(where, one.state, other.state)
-    return one.at(base[0], state[0]), one.at(base[1], state[1])
-
-
-def _drawn(points: np.ndarray) -> Tensor:
-    """At most as many points [P, 3] of a scan as `two_ways` was learnt from; drawn, since density says something."""
-    chosen = np.random.default_rng(0).permutation(len(points))[:_RELIEF_POINTS]
-    return torch.from_numpy(points[chosen])
+def _scaled(
+    points: np.ndarray,  # [N, 3] of a scan
+    center: np.ndarray,  # [3]
+    scales: list[float],
+) -> Tensor:  # [S, P, 3]
+    """At most as many points as a generated cloud has, in several scales; drawn, since their density says something."""
+    chosen = np.random.default_rng(0).permutation(len(points))[:_DENSE_POINTS]
+    offset = np.asarray(points)[chosen] - center
+    return torch.from_numpy(np.stack([offset / scale for scale in scales]))

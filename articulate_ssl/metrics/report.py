@@ -16,6 +16,8 @@ from datamodules.atomic import atomic_write
 JSON_NAME = "metrics.json"
 CSV_NAME = "metrics.csv"
 STATISTICS = ("mean", "median", "ci95")
+# `setting` of what learnt from clouds that are known to show the same object; the usual one is not named.
+MULTI_STATE = "multi-state"
 PERCENT = (
     *("flip_rate", "above_30_rate", "seg_miou", "tree_accuracy", "root_accuracy", "legacy_seg_miou"),
     *("repeat_above_30_rate", "repeat_miou", "part_share", "probability", "margin"),
@@ -47,7 +49,8 @@ def as_csv(metrics: dict) -> str:
 
 def as_table(metrics: dict) -> Table:
     """Table for people: angles in degrees, shares in percent, lengths in rest-state diagonals."""
-    title = ", ".join(str(metrics[k]) for k in ("category", "source", "protocol") if metrics.get(k) is not None)
+    about = ("category", "source", "protocol", "setting")
+    title = ", ".join(str(metrics[k]) for k in about if metrics.get(k) is not None)
     table = Table(title=f"{title}: {metrics['samples']} clouds, {metrics['failures']} failures")
     for column in ("quantity", "of"):
         table.add_column(column)

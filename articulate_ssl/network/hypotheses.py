@@ -104,3 +104,24 @@ class Hypotheses:
         return ArticulatedShape(
             points, label, Joints(self.chain, self.axis.flatten(0, 1), pivot, self.structure.joint_type)
         )
+
+
+def either(
+    where: Tensor,  # [B] bool
+    one: Hypotheses,
+    other: Hypotheses,
+) -> Hypotheses:
+    """Of every cloud the hypotheses of `one`, or where it says not, of `other`; part proposals are those of `one`."""
+
+    def chosen(first: Tensor, second: Tensor) -> Tensor:
+        return torch.where(where.view(-1, *[1] * (first.dim() - 1)), first, second)
+
+    lines = ("confidence", "pair_pivot", "pair_axis", "pivot", "axis")
+    structure = {name: chosen(getattr(one.structure, name), getattr(other.structure, name)) for name in lines}
+    return replace(
+        one,
+        shape=CanonicalShape(*map(chosen, one.shape, other.shape)),
+        structure=replace(one.structure, **structure),
+        base=chosen(one.base, other.base),
+        state=chosen(one.state, other.state),
+    )

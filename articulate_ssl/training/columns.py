@@ -63,7 +63,7 @@ class TestColumns:
 
     Args:
         predict: The network's predictions of a batch; the second argument says whether to register.
-        search: Predictions of its `points` without it.
+        search: Predictions of a batch without it.
         refined: Whether the test itself registers.
         batches: Calibration clouds with their labels.
     """
@@ -73,7 +73,7 @@ class TestColumns:
     def __init__(
         self,
         predict: Callable[[dict[str, Tensor], bool], Prediction],
-        search: Callable[[Tensor], Prediction],
+        search: Callable[[dict[str, Tensor]], Prediction],
         refined: bool,
         batches: list[dict[str, Tensor]],
     ) -> None:
@@ -81,7 +81,7 @@ class TestColumns:
         other = (NETWORK, partial(predict, refine=False)) if refined else (REGISTERED, partial(predict, refine=True))
         labels = {name: torch.cat([batch[name] for batch in batches]) for name in batches[0]}
         self._others: dict[str, _Column] = {}
-        for name, way in ((NO_NETWORK, lambda batch: search(batch["points"])), other):
+        for name, way in ((NO_NETWORK, search), other):
             shown = announced(log, f"calibration, {TITLES[name]}", batches)
             found = concatenate([way(batch) for batch in shown])
             calibration = calibrate(found, labels)

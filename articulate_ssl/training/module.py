@@ -7,7 +7,6 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, is_dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,8 @@ from lightning.pytorch import Callback, LightningModule
 from torch import Tensor
 from torch.nn.functional import one_hot
 
+from articulate_ssl.discovery.grouped import MOST_CLOUDS
+from articulate_ssl.discovery.one_object.find import MIN_CLOUDS
 from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.geometry.orientation_range import OrientationRange
 from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE
@@ -25,10 +26,12 @@ from articulate_ssl.inference.confidence import Confidence, relative_error
 from articulate_ssl.inference.pose_estimation import InferenceOptions, PoseEstimator
 from articulate_ssl.inference.prediction import Prediction, ScanEstimate
 from articulate_ssl.losses.objective import ObjectiveOptions, rigid_loss
+from articulate_ssl.metrics.report import MULTI_STATE
 from articulate_ssl.network.articulated_network import ArticulatedNetwork
 from articulate_ssl.network.options import NetworkOptions
 from articulate_ssl.network.rigid_alignment import RigidAlignment
 from articulate_ssl.ops.progress import announced
+from articulate_ssl.ops.ranks import of_all_ranks
 from articulate_ssl.shape.observation import Observation
 from articulate_ssl.training.columns import TestColumns
 from articulate_ssl.training.explanations import learn_two_ways
@@ -45,6 +48,15 @@ from datamodules.articulated_dataset import split_labels
 log = logging.getLogger(__name__)
 
 JOINT_TYPES = {"revolute": REVOLUTE, "prismatic": PRISMATIC}
+# Terms of the loss, by the names that they are logged under.
+_LOGGED = {
+    "loss": "loss",
+    "rec": "reconstruction",
+    "reg": "joints",
+    "distill": "distillation",
+    "deviation": "deviation",
+    "seg": "segmentation",
+}
 _CONFIDENCE_WEIGHT = 0.02  # of a batch in the running mean of adjacency confidences, once fifty are seen
 
 
@@ -111,7 +123,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         self.estimator = PoseEstimator(
             self.articulated, self.rigid, iterations, observation, objective.posterior_scale, inference
         )
-        self.two_ways = self.estimator.two_ways
+        self.two_ways, self.sliding = self.estimator.two_ways, self.estimator.sliding
         self.recipe = recipe_type(self.estimator, objective, schedule, discovery)
         self.radius = RadiusStatistics()
         self.states = StateRange(num_parts - 1)
@@ -166,7 +178,9 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         """Learn from training clouds which of two explanations is right, and how far predictions can be trusted."""
         training = self.training
         self.eval()
-        if self.two_ways_samples and not self.orientation.limited and self.inference.refine:
+        # Where the frames of the collection have said which way round clouds are, nothing is left to decide.
+        decides = self.two_ways_samples and not self.orientation.limited and not self.sliding.learnt
+        if decides and self.inference.refine:
             learn_two_ways(self, self._training_clouds(self.two_ways_samples).to(self.device))
         clouds = self._training_clouds(self.calibration_samples).to(self.device)
         self.confidence.learn(*look_twice(self, clouds))
@@ -205,46 +219,75 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         """One step of stage 0, or of the recipe; under autocast only the backbones run in low precision."""
         with torch.autocast(self.device.type, enabled=False):
             points = split_labels(batch)[0]["points"].float()
-            self.radius.follow(points, self.global_step)
+            self.radius.follow(of_all_ranks(points), self.global_step)
             if self.global_step < self.schedule.rigid_steps:
                 loss = rigid_loss(self.rigid(points), points, self.estimator.observation.bidirectional)
-                self.log("loss", loss.detach(), prog_bar=True)
+                self.log("loss", of_all_ranks(loss[None]).mean(), prog_bar=True)
                 return loss
-            self.recipe.prepare(self._training_clouds, self.num_points)
+            if not self.recipe.ready:
+                self._prepare()
             outcome = self.recipe.step(points, self.global_step, self._step_generator)
             self._track(outcome)
             return outcome.loss
 
+    def _prepare(self) -> None:
+        """Let one rank find out what the recipe needs, and all take it over: found twice, it might differ in digits."""
+        found = None
+        if self.global_rank == 0:
+            try:
+                self.recipe.prepare(self._training_clouds, self.num_points, self._training_objects)
+                # In the host's memory: what is sent from one GPU would arrive on that GPU.
+                found = {name: value.cpu() for name, value in self.state_dict().items()}, self.recipe.kept()
+            except Exception as error:
+                found = error  # the other ranks must not wait for what never comes
+        found = self.trainer.strategy.broadcast(found)
+        if isinstance(found, Exception):
+            raise found
+        state, kept = found
+        self.load_state_dict(state)
+        self.to(self.device)  # buffers that are as long as what was found are new
+        self.recipe.restore(kept)
+
     def _step_generator(self) -> torch.Generator:
-        """Of what is random in this step on this rank."""
-        return torch.Generator().manual_seed(self.global_step * self.trainer.world_size + self.global_rank)
+        """Of what is random in this step, the same on every rank."""
+        return torch.Generator().manual_seed(self.global_step)
 
     def _training_clouds(self, count: int) -> Tensor:
         """A fixed subset of the training clouds [n, N, 3] with all their points."""
         batches = [split_labels(b)[0] for b in self.trainer.datamodule.discovery_dataloader(count)]
         return torch.cat([b["dense_points"] for b in batches]).float()
 
+    def _training_objects(self, count: int) -> tuple[Tensor, Tensor]:  # [n, N, 3], [n]
+        """Training clouds of whole objects, and which object each shows: known from the recording, not a label."""
+        data = self.trainer.datamodule
+        if data.manifest.view != "complete":
+            raise ValueError(
+                f"discovery.grouped needs complete clouds, and {data.folder} holds depth views; leave it out"
+            )
+        batches = list(data.discovery_dataloader(count, (MIN_CLOUDS, MOST_CLOUDS)))
+        points = torch.cat([split_labels(batch)[0]["dense_points"] for batch in batches])
+        return points.float(), torch.cat([batch["instance"] for batch in batches])
+
     @torch.no_grad()
     def _track(self, outcome: Outcome) -> None:
-        """Log the terms and the warning signs (design 3.5); follow joint states, and a tree that is learnt."""
+        """Log the terms and the warning signs (design 3.5); follow joint states, and a tree that is learnt.
+
+        All of it is of the clouds of all ranks.
+        """
         terms, selected = outcome.terms, outcome.selected
         if self.recipe.learns_tree:
             weight = max(_CONFIDENCE_WEIGHT, 1 / (self.global_step + 1))
-            self.articulated.category.follow(selected.structure.confidence, weight)
-        state = selected.state[:, 0]
+            self.articulated.category.follow(of_all_ranks(selected.structure.confidence), weight)
+        state = of_all_ranks(selected.state[:, 0])
         self.states.follow(state)
-        occupancy = one_hot(terms.association.argmax(dim=-1), self.num_parts).float().mean(dim=(0, 1))
+        occupancy = of_all_ranks(one_hot(terms.association.argmax(dim=-1), self.num_parts).float().mean(dim=1))
         spread = state.std(dim=0).mean() if len(state) > 1 else state.new_zeros(())
+        averaged = of_all_ranks(torch.stack([getattr(terms, field) for field in _LOGGED.values()])[None]).mean(dim=0)
         self.log_dict(
             {
-                "loss": terms.loss,
-                "rec": terms.reconstruction,
-                "reg": terms.joints,
-                "distill": terms.distillation,
-                "deviation": terms.deviation,
-                "seg": terms.segmentation,
+                **dict(zip(_LOGGED, averaged, strict=True)),
                 "state_spread": spread.rad2deg() if self.articulated.joint_type == REVOLUTE else spread,
-                "smallest_part": occupancy.min(),
+                "smallest_part": occupancy.mean(dim=0).min(),
             },
             prog_bar=True,
         )
@@ -283,8 +326,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         predictions = [self._predict(batch) for batch in shown]
         self.test_report = TestReport(predictions, batches, self.orientation.limited).to(self.device)
         if self.inference.columns:
-            search = partial(self.estimator.search, state_range=self.state_range)
-            self.test_columns = TestColumns(self._predict, search, self.inference.refine, batches)
+            self.test_columns = TestColumns(self._predict, self._search, self.inference.refine, batches)
 
     def test_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
         """Predict, then compare."""
@@ -302,6 +344,10 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         inputs = split_labels(batch)[0]
         return self.predict_points(inputs["points"], refine, inputs["dense_points"])
 
+    def _search(self, batch: dict[str, Tensor]) -> Prediction:
+        inputs = split_labels(batch)[0]
+        return self.estimator.search(inputs["points"], self.state_range, inputs["dense_points"])
+
     def _whole(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """The batch with as many points as registration reads; the networks still see those that they would."""
         count = max(batch["points"].shape[1], self.inference.points)
@@ -313,6 +359,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         data = self.trainer.datamodule
         metrics = self.test_report.metrics.compute()  # on every rank: it gathers
         compared = () if self.test_columns is None else (self.test_columns.compute(metrics, self.test_report),)
+        if self.recipe.multi_state:
+            metrics = {"setting": MULTI_STATE} | metrics
         if self.trainer.is_global_zero:
             checkpoint = str(self.trainer.ckpt_path)
             self.test_report.write(folder, metrics, data.manifest, checkpoint, self.inference.refine, *compared)

@@ -168,6 +168,21 @@ def test_calibration_clouds_are_fixed_rotated_dense_training_clouds(tmp_path, sy
     assert not torch.allclose(batches[0][0]["object_rotation"][0], torch.eye(3), atol=0.1)
 
 
+def test_clouds_for_discovery_are_those_of_whole_objects_if_that_is_asked_for(tmp_path):
+    write_synthetic_set(tmp_path, states=6)
+    module = data(tmp_path)
+    whole = torch.cat([batch["instance"] for batch in module.discovery_dataloader(13, (6, 8))])
+    assert whole.unique(return_counts=True)[1].sort().values.tolist() == [1, 6, 6]
+    without_labels(tmp_path / "laptop" / "procedural-complete")
+    module = data(tmp_path)  # which object a scan is of is no label
+    assert torch.equal(torch.cat([batch["instance"] for batch in module.discovery_dataloader(13, (6, 8))]), whole)
+
+
+def test_clouds_for_discovery_are_chosen_as_ever_where_objects_do_not_matter(tmp_path, synthetic_set):
+    samples = torch.cat([batch["sample"] for batch in data(tmp_path).discovery_dataloader(5)])
+    assert samples.tolist() == [6, 11, 8, 0, 3]
+
+
 def test_partial_clouds_are_not_rotated(tmp_path):
     write_synthetic_set(tmp_path, view="partial", protocol="honest")
     module = data(tmp_path, view="partial", dense_in_fit=True)

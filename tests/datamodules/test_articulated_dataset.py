@@ -13,7 +13,7 @@ from unlabelled import without_labels
 
 from articulate_ssl.geometry.screw import PRISMATIC, screw_motion
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
-from datamodules.articulated_dataset import ArticulatedDataset, split_labels, spread_subset
+from datamodules.articulated_dataset import ArticulatedDataset, clouds_of_objects, evenly, split_labels, spread_subset
 from datamodules.manifest import Manifest, ManifestError
 from datamodules.shards import SHARD_ARRAYS, ShardError, read_shard
 
@@ -172,6 +172,34 @@ def test_a_subset_has_the_size_asked_for_even_over_unequal_instances(size, expec
     instance = np.array([0] * 2 + [1] * 9 + [4])
     subset = spread_subset(instance, size)
     assert len(np.unique(subset)) == len(subset) == expected
+
+
+def test_evenly_reaches_both_ends_and_repeats_nothing():
+    assert evenly(np.arange(10, 20), 4).tolist() == [10, 13, 16, 19]
+    assert evenly(np.arange(3), 9).tolist() == [0, 1, 2]
+
+
+def _counts(instance: np.ndarray, chosen: np.ndarray) -> dict[int, int]:
+    assert len(np.unique(chosen)) == len(chosen) and (np.diff(chosen) > 0).all()
+    return {int(i): int(n) for i, n in zip(*np.unique(instance[chosen], return_counts=True), strict=True)}
+
+
+def test_clouds_of_objects_are_whole_objects_spread_evenly():
+    instance = np.arange(20).repeat(10)
+    counts = _counts(instance, clouds_of_objects(instance, 192, 8, 16))
+    assert sorted(counts.values()) == [2] + [10] * 19
+    counts = _counts(instance, clouds_of_objects(instance, 30, 8, 16))
+    assert counts == {0: 10, 10: 10, 19: 10} or counts == {0: 10, 9: 10, 19: 10}
+
+
+def test_what_has_few_clouds_comes_last_and_what_has_many_gives_some():
+    instance = np.array([0] * 3 + [1] * 40 + [2] * 9 + [4])
+    counts = _counts(instance, clouds_of_objects(instance, 25, 8, 16))
+    assert counts == {1: 16, 2: 9}
+    assert sum(_counts(instance, clouds_of_objects(instance, 30, 8, 16)).values()) == 30
+    assert _counts(instance, clouds_of_objects(instance, 99, 8, 16)) == {0: 3, 1: 40, 2: 9, 4: 1}
+    assert _counts(instance, clouds_of_objects(instance, 4, 8, 16)) == {1: 16}  # one object at least
+    assert sum(_counts(instance, clouds_of_objects(instance, 4, 50, 60)).values()) == 4  # where none has enough
 
 
 def test_without_labels_the_clouds_are_the_same_and_the_labels_are_gone(tmp_path):

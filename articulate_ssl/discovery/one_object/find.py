@@ -70,6 +70,11 @@ class OneObject:
         """Share of the points that lie off the surface of the other clouds whichever part they are moved with."""
         return float((self.misfit > CAP / 2).double().mean())
 
+    @property
+    def explained(self) -> bool:
+        """Whether so few points are off as where parts were right."""
+        return self.unexplained < _EXPLAINED
+
 
 def find_one_object(
     clouds: Tensor,  # [n, N, 3] complete, any orientation, one scale; farthest-point order, normalised as in training
@@ -100,7 +105,7 @@ def find_one_object(
             continue
         if best is None or found.unexplained < best.unexplained:
             best = found
-        if best.unexplained < _EXPLAINED:
+        if best.explained:
             break
     _announce(_STAGES, "done")
     if best is None:

@@ -27,6 +27,7 @@ from torch import Tensor
 from articulate_ssl.inference.pose_estimation import Iteration
 from articulate_ssl.losses.balanced_assignment import balanced_assignment
 from articulate_ssl.losses.objective import paper_terms
+from articulate_ssl.ops.ranks import of_all_ranks, own_rows
 from articulate_ssl.training.recipes.recipe import Outcome, Recipe
 
 STATE_COMBINATIONS = 4  # of joint states that hypotheses start from, at most, where the options leave it open
@@ -87,8 +88,8 @@ class TrainingRecipe(Recipe):
         return 1.0 if shared == 0 else min(max(progress - shared, 0.0) / max(0.5 * (1 - shared), 1e-6), 1.0)
 
     def _spread(self, iteration: Iteration) -> Tensor:
-        """Of every cloud a hypothesis [B], each start of the joint states for equally many clouds of the batch."""
+        """Of every cloud a hypothesis [B], each start of the joint states for equally many clouds of all ranks."""
         starts = len(self.estimator.articulated.pose_head.anchors)
         least, element = iteration.ranked.unflatten(1, (-1, starts)).min(dim=1)  # [B, A], over the group
-        start = balanced_assignment(least)
+        start = own_rows(balanced_assignment(of_all_ranks(least)))
         return element.gather(1, start[:, None])[:, 0] * starts + start

@@ -65,16 +65,29 @@ class Recipe(ABC):
         return 0
 
     @property
+    def multi_state(self) -> bool:
+        """Whether the recipe uses which clouds show the same object, which results have to say."""
+        return False
+
+    @property
     def ready(self) -> bool:
         """Whether the networks have begun to learn, so that it makes sense to validate them."""
         return True
 
-    def prepare(self, clouds: Callable[[int], Tensor], num_points: int) -> None:
-        """What comes before the first step after stage 0. Called before every step; does something once.
+    def prepare(
+        self,
+        clouds: Callable[[int], Tensor],
+        num_points: int,
+        objects: Callable[[int], tuple[Tensor, Tensor]],
+    ) -> None:
+        """What comes before the first step after stage 0, unless the recipe is ready. Done by one rank, for all.
+
+        Others take over what it found: the module's state, and what `kept` says.
 
         Args:
-            clouds: Gives so many training clouds [n, N, 3], with all their points; the same on every rank.
+            clouds: Gives so many training clouds [n, N, 3], with all their points.
             num_points: Of a cloud in training.
+            objects: Gives about as many [n, N, 3] of whole objects, and which object each shows [n].
         """
         return
 
@@ -88,7 +101,8 @@ class Recipe(ABC):
         """The loss of a batch of training clouds.
 
         Args:
-            generator: Makes one for what is random in this step; ranks differ.
+            generator: Makes one for what is random in this step, the same on every rank: each draws for the clouds of
+                all, and takes its own (`ops.ranks`).
         """
 
     @abstractmethod

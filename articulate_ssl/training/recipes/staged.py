@@ -11,17 +11,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from articulate_ssl.discovery.discover import discover
+from articulate_ssl.discovery.grouped import discover_grouped, refuse_views
 from articulate_ssl.discovery.proposals import load_proposals
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
 from articulate_ssl.inference.pose_estimation import Iteration
 from articulate_ssl.losses.objective import PoseTarget, staged_terms
 from articulate_ssl.network.hypotheses import Hypotheses
+from articulate_ssl.ops.ranks import own_rows, world
 from articulate_ssl.training.recipes.recipe import Outcome, Recipe
 
 # Registration that teaches, in every step: shorter than at test time. Chosen, not measured.
@@ -56,7 +59,10 @@ class TrainingRecipe(Recipe):
 
     def __init__(self, *args) -> None:
         super().__init__(*args)
-        load_proposals(self.discovery.proposals)  # a misspelt name is to be told before anything runs
+        # What makes no sense is to be told before anything runs.
+        load_proposals(self.discovery.proposals)
+        if self.discovery.grouped:
+            refuse_views(self.estimator.observation)
         self.found: HandOver | None = None
         self.group = rotation_group(len(self.estimator.articulated.pose_head.elements))
 
@@ -66,22 +72,40 @@ class TrainingRecipe(Recipe):
         return self._warm
 
     @property
+    def multi_state(self) -> bool:
+        """Where part discovery does."""
+        return self.discovery.grouped
+
+    @property
     def ready(self) -> bool:
         """After discovery."""
         return self.found is not None
 
-    def prepare(self, clouds: Callable[[int], Tensor], num_points: int) -> None:
-        """Part discovery, once."""
-        if self.found is not None:
-            return
-        dense, network = clouds(self.discovery.clouds), self.estimator.articulated
+    def prepare(
+        self,
+        clouds: Callable[[int], Tensor],
+        num_points: int,
+        objects: Callable[[int], tuple[Tensor, Tensor]],
+    ) -> None:
+        """Part discovery."""
+        options, network = self.discovery, self.estimator.articulated
+        if options.grouped:
+            dense, instance = objects(options.clouds)
+            find = partial(discover_grouped, dense, instance, network.num_parts, network.joint_type, options)
+        else:
+            dense = clouds(options.clouds)
+            observation = self.estimator.observation
+            find = partial(discover, dense, network.num_parts, network.joint_type, options, observation)
         with torch.random.fork_rng(devices=[]), torch.no_grad():
-            found = discover(dense, network.num_parts, network.joint_type, self.discovery, self.estimator.observation)
+            found = find()
         kept = found.error.argsort()[: self.discovery.kept(len(dense))]
         self.found = HandOver(
             dense[kept, :num_points], found.base[kept], found.state[kept], found.log_stretch[kept], found.limits()
         )
         network.category.adopt(found.shape)
+        if found.axes is not None:  # in a frame that the clouds share
+            shape = network.category.articulated_shape(network.joint_type)
+            self.estimator.sliding.learn(shape, found.limits(), dense[kept], found.base[kept])
 
     def step(self, points: Tensor, step: int, generator: Callable[[], torch.Generator]) -> Outcome:
         """Warm-up or self-supervision."""
@@ -128,8 +152,9 @@ class TrainingRecipe(Recipe):
     ) -> tuple[Tensor, PoseTarget]:
         """A batch of them in random orientations, aligned [B, N, 3], and where the shape is in each."""
         orientation = self.estimator.observation.orientation
-        index = torch.randint(len(self.found.points), (size,), generator=generator)
-        rotation = orientation.draw(size, generator).to(device)
+        of_all, _ = world()
+        index = own_rows(torch.randint(len(self.found.points), (of_all * size,), generator=generator))
+        rotation = own_rows(orientation.draw(of_all * size, generator)).to(device)
         points, base, state = (
             value[index].to(device) for value in (self.found.points, self.found.base, self.found.state)
         )

@@ -182,6 +182,15 @@ def test_what_is_not_defined_or_not_there_is_a_dash(tmp_path, monkeypatch):
     assert text.count("–") >= 12 + 12 and "- it failed; its log says why" in text
 
 
+@pytest.mark.parametrize(("more", "given"), [({}, "clouds"), ({"setting": "multi-state"}, "clouds, which clouds show")])
+def test_a_row_says_if_it_was_given_which_clouds_show_one_object(tmp_path, monkeypatch, more, given):
+    monkeypatch.setattr(Job, "finished", True)
+    monkeypatch.setattr(Job, "report", lambda _self, _column: _report() | more)
+    text = as_markdown(collect(_setting(tmp_path, "complete"), ["staged"], [0], []))
+    row = next(line for line in text.splitlines() if line.startswith("| ours, staged"))
+    assert f"| {given}" in row and ("one object" in row) == bool(more)
+
+
 def test_failures_and_bad_names_are_exit_codes(tmp_path, programs, capsys):
     options = ["--build", str(tmp_path), "--methods"]
     assert command.main([*options, "magic"]) == 2

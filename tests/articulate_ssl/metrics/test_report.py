@@ -6,7 +6,7 @@ from articulated_world import articulated_labels
 
 from articulate_ssl.baselines.perfect_oracle import perfect_oracle
 from articulate_ssl.metrics import ArticulatedPoseMetrics, calibrate
-from articulate_ssl.metrics.report import CSV_NAME, JSON_NAME, write_report
+from articulate_ssl.metrics.report import CSV_NAME, JSON_NAME, MULTI_STATE, write_report
 
 META = {
     "category": "eyeglasses",
@@ -48,6 +48,13 @@ def test_table_speaks_percent_and_degrees(tmp_path, metrics, capsys):
     assert "100.0 %" in printed
     assert "r_err_deg" in printed
     assert "24 clouds, 0 failures" in printed
+
+
+def test_a_setting_that_is_not_the_usual_one_is_named(tmp_path, metrics, capsys):
+    write_report(tmp_path, {"setting": MULTI_STATE} | metrics, **META)
+    assert "complete, multi-state: 24 clouds" in " ".join(capsys.readouterr().out.split())
+    assert json.loads((tmp_path / JSON_NAME).read_text())["setting"] == "multi-state"
+    assert "setting" not in (tmp_path / CSV_NAME).read_text()
 
 
 def test_missing_values_are_null_and_empty(tmp_path):

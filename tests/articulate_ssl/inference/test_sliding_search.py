@@ -1,0 +1,126 @@
+"""Chests are found in clouds of any orientation and proportion, by what a collection knows, without a network."""
+
+import pytest
+import roma
+import torch
+from articulated_objects import Clouds, clouds
+
+from articulate_ssl.discovery.registration import chamfer_l1
+from articulate_ssl.geometry.kinematic_chain import KinematicChain
+from articulate_ssl.geometry.screw import PRISMATIC
+from articulate_ssl.geometry.se3 import se3, transform_points
+from articulate_ssl.inference.pose_estimation import InferenceOptions, PoseEstimator
+from articulate_ssl.inference.sliding_search import SlidingSearch
+from articulate_ssl.network.articulated_network import ArticulatedNetwork
+from articulate_ssl.network.options import NetworkOptions
+from articulate_ssl.shape.articulated_shape import ArticulatedShape
+from articulate_ssl.shape.joints import Joints
+from articulate_ssl.shape.observation import Observation
+
+# A floor with two drawers of different height above its front half, which slide along x.
+CHEST = (
+    [((-0.4, 0, 0), (0.4, 0.6, 0.02)), ((0.02, 0.05, 0.1), (0.41, 0.55, 0.2)), ((0.02, 0.05, 0.25), (0.41, 0.55, 0.5))],
+    (0, 0),
+    [((1, 0, 0), (0, 0, 0)), ((1, 0, 0), (0, 0, 0))],
+    [(-0.15, 0.15), (-0.15, 0.15)],
+    PRISMATIC,
+)
+CHAIN = KinematicChain(3, 0, (0, 0), (1, 2))
+LIMITS = torch.tensor([[-0.2, 0.2], [-0.2, 0.2]])
+
+
+def _chests(count: int, seed: int) -> Clouds:
+    return clouds(CHEST, count=count, points=2048, resample=True, seed=seed)
+
+
+def _shape(data: Clouds) -> ArticulatedShape:
+    """With as many points of every part, part by part."""
+    points = torch.cat([data.rest[data.part == part][:200] for part in range(3)])
+    joints = Joints(CHAIN, data.axis, data.pivot, PRISMATIC, LIMITS)
+    return ArticulatedShape(points, torch.arange(3).repeat_interleave(200), joints)
+
+
+@pytest.fixture(scope="module")
+def learnt():
+    """A search that has learnt from eight clouds."""
+    data = _chests(8, seed=0)
+    search = SlidingSearch(3, 200)
+    assert not search.learnt
+    search.learn(_shape(data), LIMITS, data.points, data.base)
+    return search
+
+
+def test_unseen_chests_of_other_proportions_are_found(learnt):
+    data = _chests(4, seed=1)
+    proportion = torch.tensor([1.15, 0.85, 1.0])
+    standing = transform_points(torch.linalg.inv(data.base), data.points) * proportion
+    points = transform_points(data.base, standing)
+    shape, base, state = learnt.search(CHAIN, points)
+    truth = data.base[:, None, :3, :3].expand(-1, 3, -1, -1)
+    angle = roma.rotmat_geodesic_distance(base[..., :3, :3], truth).rad2deg()
+    posed = shape.posed(base.flatten(0, 1), state.flatten(0, 1))
+    error = chamfer_l1(points[:, :512].repeat_interleave(3, dim=0), posed).unflatten(0, (4, 3))
+    best = error.argmin(dim=1, keepdim=True)
+    assert angle.gather(1, best).max() < 5
+    found = state.gather(1, best[..., None].expand(-1, 1, 2))[:, 0]
+    assert (found - proportion[0] * data.state).abs().median() < 0.03
+    assert (angle > 80).any()  # the other turns are other ways round
+
+
+def test_a_gallery_that_was_turned_over_turns_predictions_over(learnt):
+    data = _chests(4, seed=2)
+    over = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
+    other = SlidingSearch(3, 200)
+    other.load_state_dict(learnt.state_dict())
+    other.gallery = learnt.gallery @ over
+    torch.testing.assert_close(other.turns(data.points)[:, 0], over @ learnt.turns(data.points)[:, 0])
+
+
+def test_clouds_do_not_interact_and_the_gallery_is_saved(learnt):
+    data = _chests(2, seed=3)
+    again = SlidingSearch(3, 200)
+    again.load_state_dict(learnt.state_dict())
+    assert again.learnt
+    for together, alone in zip(
+        learnt.search(CHAIN, data.points)[1:], again.search(CHAIN, data.points[1:2])[1:], strict=True
+    ):
+        torch.testing.assert_close(together[1:2], alone, atol=1e-4, rtol=0)
+
+
+def test_weights_from_before_there_was_a_search_have_none(learnt):
+    old = {name: value for name, value in learnt.state_dict().items() if name == "points"}
+    search = SlidingSearch(3, 200)
+    search.load_state_dict({"points": old["points"]})
+    assert not search.learnt
+
+
+def test_too_few_points_are_refused(learnt):
+    with pytest.raises(ValueError, match="512 points"):
+        learnt.learn(_shape(_chests(1, seed=0)), LIMITS, torch.rand(4, 100, 3), torch.eye(4).expand(4, 4, 4))
+
+
+def test_the_search_competes_with_the_network(learnt):
+    options = NetworkOptions(
+        group_order=12, dims=(8, 8, 8), num_neighbors=8, num_centers=(128, 64, 32), head_dim=8, shape_points=200
+    )
+    torch.manual_seed(0)
+    network = ArticulatedNetwork(options, 3, PRISMATIC).eval()
+    estimator = PoseEstimator(network, None, 1, Observation(), 0.05, InferenceOptions(refine=True))
+    data = _chests(2, seed=4)
+    network.category.adopt(_shape(data))
+    points = data.points[:, :256]
+    without = estimator.predict(points, 256, dense=data.points)
+    estimator.sliding.load_state_dict(learnt.state_dict())
+    found = estimator.predict(points, 256, dense=data.points)
+    alone = estimator.search(points, torch.zeros(2, 2), data.points)
+    truth = data.base[:, :3, :3]
+    for prediction in (found, alone):
+        assert roma.rotmat_geodesic_distance(prediction.base_pose[:, :3, :3], truth).rad2deg().max() < 5
+        # Parts where the shape has them, at the cloud's own proportions.
+        whole = prediction.part_shape + prediction.assembly[:, :, None]
+        pose = se3(prediction.base_pose[:, :3, :3], prediction.base_pose[:, :3, 3])
+        body = transform_points(pose, whole[:, 0])
+        assert torch.cdist(body, points).amin(dim=2).mean() < 0.05
+    assert (found.reconstruction_error <= without.reconstruction_error).all()
+    unread = estimator.predict(points, 256)
+    torch.testing.assert_close(unread.reconstruction_error, without.reconstruction_error)

@@ -1,0 +1,106 @@
+"""Which clouds show the same object reaches discovery where it is asked for, and nothing else of the labels does."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from synthetic import write_synthetic_set
+from tiny import DISCOVERY, POINTS, fit, quiet_trainer, tiny_data, tiny_module
+from unlabelled import without_labels
+
+from articulate_ssl.discovery.registered_shape import RegisteredShape
+from articulate_ssl.geometry.kinematic_chain import KinematicChain
+from articulate_ssl.geometry.screw import REVOLUTE
+from articulate_ssl.losses.objective import ObjectiveOptions
+from articulate_ssl.shape.articulated_shape import ArticulatedShape
+from articulate_ssl.shape.joints import Joints
+from articulate_ssl.training.recipes import staged
+
+GROUPED = replace(DISCOVERY, clouds=18, grouped=True)
+
+
+@pytest.fixture
+def seen(monkeypatch):
+    """What discovery is given; what it finds is some shape."""
+    calls = {}
+
+    def grouped(clouds, instance, *category):
+        calls["grouped"] = clouds, instance, *category
+        return _some_shape(clouds)
+
+    def single(clouds, *rest):
+        calls["single"] = clouds, *rest
+        return _some_shape(clouds)
+
+    monkeypatch.setattr(staged, "discover_grouped", grouped)
+    monkeypatch.setattr(staged, "discover", single)
+    return calls
+
+
+def _some_shape(clouds):
+    """Whose registrations are the better, the later the cloud."""
+    count = len(clouds)
+    joints = Joints(KinematicChain(2, 0, (0,), (1,)), torch.tensor([[0.0, 1.0, 0.0]]), torch.zeros(1, 3), REVOLUTE)
+    shape = ArticulatedShape(clouds[0], torch.arange(clouds.shape[1]) % 2, joints)
+    state, stretch = torch.linspace(-1, 1, count)[:, None], torch.zeros(count, 2, 3)
+    return RegisteredShape(shape, torch.eye(4).repeat(count, 1, 1), state, stretch, -torch.arange(float(count)))
+
+
+def _object_of(root, clouds):
+    """The object that each cloud shows, by its points: no rotation changes their distances to the origin."""
+    batches = list(tiny_data(root).discovery_dataloader(99))
+    stored = torch.cat([batch["dense_points"] for batch in batches]).norm(dim=-1)
+    nearest = torch.cdist(clouds.norm(dim=-1), stored).argmin(dim=1)
+    return torch.cat([batch["instance"] for batch in batches])[nearest]
+
+
+@pytest.mark.parametrize("labelled", [True, False])
+def test_which_object_a_cloud_shows_reaches_discovery(tmp_path, seen, labelled):
+    folder = write_synthetic_set(tmp_path, states=9)
+    if not labelled:
+        without_labels(folder)
+    module = tiny_module(discovery=GROUPED)
+    fit(module, tmp_path, 1)
+    assert seen.keys() == {"grouped"}
+    clouds, instance, *category = seen["grouped"]
+    assert category == [2, module.articulated.joint_type, GROUPED]
+    assert clouds.shape == (18, 128, 3) and clouds.dtype == torch.float32
+    assert torch.equal(instance, _object_of(tmp_path, clouds))
+    assert instance.unique(return_counts=True)[1].tolist() == [9, 9]  # whole objects
+    # Of these clouds, the three quarters that were registered best are handed over.
+    assert torch.equal(module.recipe.found.points, clouds.flip(0)[:13, :POINTS])
+
+
+def test_unless_it_is_asked_for_discovery_is_given_single_clouds(tmp_path, seen):
+    write_synthetic_set(tmp_path)
+    module = tiny_module()
+    fit(module, tmp_path, 1)
+    assert seen.keys() == {"single"}
+    clouds, *rest = seen["single"]
+    assert rest == [2, module.articulated.joint_type, DISCOVERY, module.estimator.observation]
+    expected = torch.cat([batch["dense_points"] for batch in tiny_data(tmp_path).discovery_dataloader(6)])
+    assert torch.equal(clouds, expected)
+
+
+@pytest.mark.parametrize("grouped", [True, False])
+def test_a_test_names_the_setting(tmp_path, grouped):
+    write_synthetic_set(tmp_path)
+    module = tiny_module(discovery=replace(DISCOVERY, grouped=grouped))
+    quiet_trainer(tmp_path).test(module, tiny_data(tmp_path), verbose=False)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics.get("setting") == ("multi-state" if grouped else None)
+
+
+@pytest.mark.parametrize(
+    "options", [{"orientation_range": 100.0}, {"objective": ObjectiveOptions(unidirectional=True)}]
+)
+def test_options_for_depth_views_are_refused_at_once(options):
+    with pytest.raises(ValueError, match="grouped needs complete clouds"):
+        tiny_module(discovery=GROUPED, **options)
+
+
+def test_depth_views_are_refused_when_training_starts(tmp_path):
+    write_synthetic_set(tmp_path, view="partial", protocol="honest")
+    with pytest.raises(ValueError, match=r"grouped needs complete clouds, and .* holds depth views"):
+        fit(tiny_module(discovery=GROUPED), tmp_path, 1, view="partial", protocol="honest")
