@@ -39,7 +39,8 @@ class InstanceFit:
     """Labels and joint lines that n clouds share, and of every cloud its pose, joint states and stretch of each part.
 
     Parts stretch along the principal axes they have in the template: the root about its centre, any other part about
-    the pivot of its joint, which moves with the part it is on (`shape.stretch`).
+    the pivot of its joint, which moves with the part it is on (`shape.stretch`). In a frame that clouds have in common,
+    where parts slide, they also lie elsewhere beside their slide: drawers of one chest are lower than those of another.
 
     Args:
         shape: Points and labels at joint state zero; states stay within the joints' limits if there are any.
@@ -62,7 +63,7 @@ class InstanceFit:
         self._shape, self._base, self._generator = shape, base, generator
         self._axis, self._pivot, self._state = shape.joints.axis.clone(), shape.joints.pivot.clone(), state.clone()
         self._turn, self._shift = (base.new_zeros(len(base), 3) for _ in range(2))
-        self._stretch = base.new_zeros(len(base), shape.num_parts, 3)
+        self._stretch, self._beside = (base.new_zeros(len(base), shape.num_parts, 3) for _ in range(2))
         if log_stretch is not None:
             self._stretch += _BOUND * (log_stretch / _BOUND).clamp(-_START, _START).atanh()
         self.axes = axes
@@ -103,7 +104,7 @@ class InstanceFit:
         moved = replace(shape, joints=replace(shape.joints, pivot=pivots))
         state = moved.read_states(shape.joints.part_pose(base, state))
         other = InstanceFit(moved, base, state, self._generator, self.axes)
-        other._stretch = self._stretch.clone()
+        other._stretch, other._beside = self._stretch.clone(), self._beside.clone()
         return other
 
     def optimise(
@@ -122,6 +123,7 @@ class InstanceFit:
         own = [self._state, self._turn, self._shift, self._stretch]
         # In a frame that clouds have in common, what slides slides along one of its axes, exactly.
         lines = [self._axis, self._pivot] if self.axes is None else [self._pivot]
+        own = own if self.axes is None else [*own, self._beside]
         parameters = lines + own if shared else own
         optimizer = torch.optim.Adam([p.requires_grad_() for p in parameters], lr=_RATE)
         for cycle in range(cycles):
@@ -171,8 +173,16 @@ class InstanceFit:
 
     def _stretched(self) -> tuple[PartMaps, Joints]:
         """From the template to each cloud's own shape, and that shape's joints."""
-        rest, pivots = hinged(stretch_matrices(self._axes, self.log_stretch), self._center, self._joints())
-        return rest, replace(self._joints(), pivot=pivots)
+        joints = self._joints()
+        rest, pivots = hinged(stretch_matrices(self._axes, self.log_stretch), self._center, joints)
+        if self.axes is not None:
+            children, slide = list(joints.chain.child), joints.axis
+            along = (self._beside[:, children] * slide).sum(dim=-1, keepdim=True)
+            beside = self._beside[:, children] - along * slide
+            pivots = pivots + beside
+            part = torch.eye(self._shape.num_parts).to(beside)[children]  # [J, K]
+            rest = replace(rest, shift=rest.shift + torch.einsum("jk,njd->nkd", part, beside))
+        return rest, replace(joints, pivot=pivots)
 
     def _joints(self) -> Joints:
         axis = functional.normalize(self._axis, dim=-1)
@@ -183,7 +193,7 @@ class InstanceFit:
         posed, seen = self.posed(rows), clouds[:, self._draw(clouds.shape[1], clouds.device)]
         error = _softened(_distance(posed, seen)).mean(dim=1) + _softened(_distance(seen, posed)).mean(dim=1)
         counts = error.detach() <= error.detach().quantile(keep)
-        return error[counts].sum() + _RIDGE * self._stretch.square().sum()
+        return error[counts].sum() + _RIDGE * (self._stretch.square().sum() + self._beside.square().sum())
 
     def _draw(self, total: int, device: torch.device) -> Tensor:
         return torch.randperm(total, generator=self._generator)[:_POINTS].to(device)

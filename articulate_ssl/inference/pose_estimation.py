@@ -180,17 +180,6 @@ class Candidates:
     base: Tensor
     select: Callable[[Tensor], Hypotheses]
 
-    def beside(self, other: Candidates) -> Candidates:
-        """These, and others behind them."""
-        count = self.error.shape[1]
-
-        def select(index: Tensor) -> Hypotheses:
-            mine, others = self.select(index.clamp(max=count - 1)), other.select((index - count).clamp(min=0))
-            return either(index < count, mine, others)
-
-        error, base = torch.cat([self.error, other.error], dim=1), torch.cat([self.base, other.base], dim=1)
-        return Candidates(error, base, select)
-
 
 class PoseEstimator:
     """Pose estimation with the networks of a module, which owns them, trains them and saves them.
@@ -314,8 +303,9 @@ class PoseEstimator:
             registers = (self.inference.refine if refine is None else refine) is not False
             candidates = self._candidates(points, num_points, registers)
             if registers and dense is not None and self.sliding.learnt:
-                candidates = candidates.beside(self._slid(points, dense))
-            chosen, other, margin = self._best(candidates)
+                chosen, other, margin = self._slid(points, dense, candidates)
+            else:
+                chosen, other, margin = self._best(candidates)
             if registers and dense is not None and self.two_ways.learnt:
                 twin = self._twin(chosen, points)
                 odds = self.two_ways.log_odds(self._relief(chosen, dense), self._relief(twin, dense))
@@ -357,28 +347,33 @@ class PoseEstimator:
         self,
         points: Tensor,  # [B, N, 3]
         dense: Tensor,  # [B, P, 3]
-    ) -> Candidates:
-        """The category's shape where the search for sliding parts finds it, at the clouds' own proportions."""
-        articulated, size = self.articulated, points.shape[:1]
-        shape, base, state = self.sliding.search(articulated.category.chain(), dense)
-        count = base.shape[1]
-        posed = shape.posed(base.flatten(0, 1), state.flatten(0, 1))
-        copies = points.repeat_interleave(count, dim=0)
-        error = chamfer_l1(copies, posed, self.observation.bidirectional).unflatten(0, (*size, count))
-        parts = shape.points.unflatten(1, (articulated.num_parts, -1))
-        rows = torch.arange(*size, device=points.device)
+        others: Candidates | None = None,
+    ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
+        """The category's shape where the search for sliding parts finds it, its rival, and the margin between them.
+
+        Which way round clouds are, the search decides. Others that are turned alike compete by their errors.
+        """
+        shape, base, state, cost = self.sliding.search(self.articulated.category.chain(), dense)
+        clouds, count = cost.shape
+        rows, parts = torch.arange(clouds, device=points.device), shape.points.unflatten(1, (shape.num_parts, -1))
 
         def select(index: Tensor) -> Hypotheses:
             own = rows * count + index
             center = parts[own].mean(dim=2)
-            found = articulated.category_at(base[rows, index, None], state[rows, index, None])
-            structure = replace(
-                found.structure, pivot=shape.joints.pivot[own], axis=shape.joints.axis.expand(*size, 1, -1, -1)
-            )
-            shapes = CanonicalShape(parts[own] - center[:, :, None], center)
-            return replace(found, shape=shapes, structure=structure)
+            found = self.articulated.category_at(base[rows, index, None], state[rows, index, None])
+            axis = shape.joints.axis.expand(clouds, 1, -1, -1)
+            structure = replace(found.structure, pivot=shape.joints.pivot[own], axis=axis)
+            return replace(found, shape=CanonicalShape(parts[own] - center[:, :, None], center), structure=structure)
 
-        return Candidates(error, base, select)
+        first, rival = select(torch.zeros_like(rows)), select(torch.ones_like(rows))
+        margin = (1 - cost[:, 0] / cost[:, 1]).clamp(0, 1)
+        if others is None:
+            return first, rival, margin
+        error = chamfer_l1(points, first.posed()[:, 0].flatten(1, 2), self.observation.bidirectional)
+        turn = first.base[:, :, :3, :3].expand_as(others.base[..., :3, :3])
+        away = roma.rotmat_geodesic_distance(others.base[..., :3, :3], turn) > _ANOTHER_WAY
+        least, index = others.error.masked_fill(away, torch.inf).min(dim=1)
+        return either(error <= least, first, others.select(index)), rival, margin
 
     def _twin(
         self,
@@ -427,7 +422,7 @@ class PoseEstimator:
         """
         with torch.autocast(points.device.type, enabled=False):
             if dense is not None and self.sliding.learnt:
-                found, _, margin = self._best(self._slid(points, dense))
+                found, _, margin = self._slid(points, dense)
                 return self._prediction(found, points, margin)
             low, high = state_range.to(points).unbind(-1)
             middle, side = (low + high) / 2, _SIDE * (high - low)

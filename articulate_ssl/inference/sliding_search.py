@@ -2,8 +2,8 @@
 
 Chests are boxes: every cloud shows its Manhattan frame, but not which of its 24 rotations is upright, and any single
 chest is right about that too rarely. Discovery has settled it for a whole collection (`discovery.synchronization`); so
-a new cloud is turned as it is most like a few of those, stretched to one box. The category's shape is then placed in
-it by what every offset costs, stretched to its proportions, and the turn that leaves the smallest error is chosen.
+a new cloud is turned as it is most like clouds of many of those chests, all stretched to one box. That decides: a
+shape that is placed in the cloud by what every offset costs, and stretched, fits about as well upside down.
 """
 
 from __future__ import annotations
@@ -22,9 +22,10 @@ from articulate_ssl.geometry.se3 import se3
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.joints import Joints
 
-# Of 150 clouds of unseen chests, the first turn was right for 92 % by 16 clouds, 91 % by 64 and 95 % by 192, one of the
-# first three for 99, 97 and 97 % (docs/experiments.md, step 63): the shape decides among three.
-_GALLERY, _GALLERY_POINTS, _TURNS = 16, 512, 3
+# Of 150 clouds of unseen chests, the first turn was right for 88 % by 8 clouds, 90 % by 16, 88 to 91 % by 32, 95 % by
+# 192; of 75, the turn of the better fit for 40 % where the first was right for 71 % (docs/experiments.md, step 63).
+_GALLERY, _GALLERY_POINTS = 32, 512
+_TURNS = 2  # the likeliest, and its rival
 _FITTED_POINTS = 1024  # of a cloud, to which the shape is fitted
 _PLACED_POINTS = 256  # of the shape, whose offsets are tried
 _CYCLES = 4  # of the descent on every candidate; twice as many on the best
@@ -58,17 +59,18 @@ class SlidingSearch(nn.Module):
         self,
         shape: ArticulatedShape,  # M points of every part in turn, in a frame common to the clouds
         limits: Tensor,  # [J, 2]
-        clouds: Tensor,  # [n, N, 3] training clouds, N >= 512, best explained first
+        clouds: Tensor,  # [n, N, 3] training clouds, N >= 512
         base: Tensor,  # [n, 4, 4] canonical object space -> cloud
     ) -> None:
-        """Keep a shape, and some of the clouds it was found in.
+        """Keep a shape, and some of the clouds it was found in, spread evenly.
 
         Raises:
             ValueError: if the clouds have too few points.
         """
         if clouds.shape[1] < _GALLERY_POINTS:
             raise ValueError(f"{_GALLERY_POINTS} points of a cloud are compared, these have {clouds.shape[1]}")
-        boxes, _, _ = unit_boxes(clouds[:_GALLERY] @ base[:_GALLERY, :3, :3])
+        some = torch.linspace(0, len(clouds) - 1, min(len(clouds), _GALLERY)).round().long()
+        boxes, _, _ = unit_boxes(clouds[some] @ base[some, :3, :3])
         self.gallery = boxes[:, :_GALLERY_POINTS].contiguous()
         self.points.copy_(shape.points.view_as(self.points))
         self.axis.copy_(shape.joints.axis)
@@ -79,38 +81,41 @@ class SlidingSearch(nn.Module):
     def turns(
         self,
         clouds: Tensor,  # [B, N, 3] with all their points
-    ) -> Tensor:  # [B, 3, 3, 3]
-        """Rotations cloud -> canonical orientation, the likeliest three, best first."""
+    ) -> tuple[Tensor, Tensor]:  # [B, 2, 3, 3], [B, 2]
+        """Rotations cloud -> canonical orientation, the likeliest two, and their distances to the gallery."""
         rotation, _ = manhattan_frames(clouds, torch.Generator().manual_seed(0))
         boxes, _, _ = unit_boxes(clouds @ rotation.mT)
         group = rotation_group(24).elements.to(clouds)
         # What is g @ box in canonical orientation lies in the box where the inverse of g puts it.
         turned = torch.einsum("gji,rpj->grpi", group, self.gallery.to(clouds))
-        found = []
+        found, costs = [], []
         for box, frame in zip(boxes, rotation, strict=True):
             cost = DistanceFields.of(box[None]).at(0, turned).clamp(max=CAP).mean(dim=(1, 2))
-            found.append(group[cost.topk(_TURNS, largest=False).indices] @ frame)
-        return torch.stack(found)
+            least = cost.topk(_TURNS, largest=False)
+            found.append(group[least.indices] @ frame)
+            costs.append(least.values)
+        return torch.stack(found), torch.stack(costs)
 
     @torch.no_grad()
     def search(
         self,
         chain: KinematicChain,
         clouds: Tensor,  # [B, N, 3] with all their points
-    ) -> tuple[ArticulatedShape, Tensor, Tensor]:
-        """The shape in every cloud, in each of three turns.
+    ) -> tuple[ArticulatedShape, Tensor, Tensor, Tensor]:
+        """The shape in every cloud, in each of two turns, the likelier first.
 
         Returns:
-            The shapes of 3 B candidates, stretched to the clouds' proportions (points [3 B, K M, 3]), their base poses
-            [B, 3, 4, 4] and joint states [B, 3, J].
+            The shapes of 2 B candidates, stretched to the clouds' proportions (points [2 B, K M, 3]), their base poses
+            [B, 2, 4, 4] and joint states [B, 2, J], and how far the clouds are from the gallery [B, 2].
         """
-        turn = self.turns(clouds)
+        turn, cost = self.turns(clouds)
         copies = torch.einsum("bcij,bnj->bcni", turn, clouds[:, :_FITTED_POINTS]).flatten(0, 1)
         axes = torch.eye(3).to(clouds).expand(len(self.points), 3, 3)
         generator = torch.Generator().manual_seed(0)
         fit = fit_slides(self._shape(chain), axes, copies, _PLACED_POINTS, _CYCLES, generator)
         back = se3(turn.mT, turn.new_zeros(*turn.shape[:2], 3))
-        return fit.instances(), back @ fit.base.unflatten(0, turn.shape[:2]), fit.state.unflatten(0, turn.shape[:2])
+        base, state = (value.unflatten(0, turn.shape[:2]) for value in (fit.base, fit.state))
+        return fit.instances(), back @ base, state, cost
 
     def _shape(self, chain: KinematicChain) -> ArticulatedShape:
         label = torch.arange(len(self.points), device=self.points.device).repeat_interleave(self.points.shape[1])

@@ -99,7 +99,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         discovery: DiscoveryOptions = DiscoveryOptions(),  # noqa: B008
         inference: InferenceOptions = InferenceOptions(),  # noqa: B008
         calibration_samples: int = 128,
-        two_ways_samples: int = 800,
+        two_ways_samples: int = 1000,
         orientation_range: float = 180.0,
     ) -> None:
         super().__init__()
