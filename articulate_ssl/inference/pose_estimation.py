@@ -67,6 +67,9 @@ class InferenceOptions:
         rounds: Rounds of registration.
         coarse_scale: First standard deviation of the correspondences, in normalised units.
         fine_scale: Last one.
+        part_neighbours: So many points of a posed part say by their mean distance how near it is to a point, which
+            belongs to the nearest part; null leaves it to the recipe (1 staged, 6 paper, whose shapes have some points
+            on other parts).
         columns: Report at test time, from the same clouds, what the category's shape without a network reaches, the
             network alone, and the network with registration (`training/columns.py`).
     """
@@ -77,6 +80,7 @@ class InferenceOptions:
     rounds: int = 8
     coarse_scale: float = 0.05
     fine_scale: float = 0.02
+    part_neighbours: int | None = None
     columns: bool = False
 
 
@@ -514,7 +518,7 @@ class PoseEstimator:
         chain = chosen.chain
         parent = torch.tensor(chain.parent, device=points.device)
         posed = chosen.posed()[:, 0]
-        to_part = distances_to_parts(points, posed)
+        to_part = distances_to_parts(points, posed, self.inference.part_neighbours or 1)
         shape = (len(points), len(parent))
         axis, pivot = _joint_lines(chosen, pose)
         return Prediction(

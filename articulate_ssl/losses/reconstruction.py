@@ -18,8 +18,17 @@ _SINKHORN_ROUNDS = 5  # chosen without a measurement
 def distances_to_parts(
     points: Tensor,  # [B, N, 3]
     posed: Tensor,  # [B, K, M, 3]
+    neighbours: int = 1,
 ) -> Tensor:  # [B, N, K]
-    """Distance of every input point to every posed part; differentiable in the parts."""
+    """Distance of every input point to every posed part; differentiable in the parts.
+
+    Args:
+        neighbours: Mean distance to so many points of the part, or to all, if it has fewer.
+    """
+    if neighbours > 1:
+        count = min(neighbours, posed.shape[2])
+        near = torch.cdist(points[:, None], posed).topk(count, largest=False).values  # [B, K, N, count]
+        return near.mean(dim=-1).transpose(1, 2)
     query = points[:, None].expand(-1, posed.shape[1], -1, -1)
     return _gap(query, posed, nearest_index(query, posed)).transpose(1, 2)
 

@@ -112,6 +112,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             network = replace(network, state_anchors=recipe_type.state_anchors(num_parts))
         if inference.refine is None:
             inference = replace(inference, refine=recipe_type.refines)
+        if inference.part_neighbours is None:
+            inference = replace(inference, part_neighbours=recipe_type.part_neighbours)
         self.category, self.num_parts, self.schedule = category, num_parts, schedule
         self.inference, self.calibration_samples = inference, calibration_samples
         self.two_ways_samples = two_ways_samples

@@ -55,7 +55,8 @@ class Recipe(ABC):
         self.estimator, self.objective = estimator, objective
         self.schedule, self.discovery = schedule, discovery
 
-    refines = True  # by registration at test time, where the options leave it to the recipe
+    # At test time, where the options leave it to the recipe: by registration, and `InferenceOptions.part_neighbours`.
+    refines, part_neighbours = True, 1
     learns_tree = True  # or it was found before, and stays
     cheap_steps = 0  # so many at the start are of another kind, which takes less time than the steps to come
 

@@ -51,6 +51,20 @@ def test_distances_to_parts_are_nearest_distances():
     _assert_same(distances_to_parts(points, posed), _naive_to_parts(points, posed), posed)
 
 
+def test_of_several_nearest_points_one_that_strayed_decides_nothing():
+    generator = torch.Generator().manual_seed(0)
+    near, far = 0.1 * torch.rand(1, 20, 3, generator=generator), 1 + 0.1 * torch.rand(1, 20, 3, generator=generator)
+    points = near[:, :1] + 0.01
+    far[:, 0] = points[:, 0]  # a point of the far part where the near one is
+    posed = torch.stack([near, far], dim=1)
+    assert distances_to_parts(points, posed).argmin(dim=-1) == 1
+    several = distances_to_parts(points, posed, 3)
+    assert several.argmin(dim=-1) == 0
+    expected = (points[:, None] - posed).norm(dim=-1).sort(dim=-1).values[..., :3].mean(dim=-1)
+    torch.testing.assert_close(several[:, 0], expected, atol=1e-3, rtol=0)
+    assert torch.equal(distances_to_parts(points, posed, 50), distances_to_parts(points, posed, 20))
+
+
 @pytest.mark.parametrize("labelled", [False, True])
 def test_distances_to_the_cloud_are_nearest_distances(labelled):
     points, posed, labels = _clouds()

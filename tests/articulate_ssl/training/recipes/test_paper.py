@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from articulate_ssl.geometry.se3 import transform_points
 from articulate_ssl.inference.pose_estimation import InferenceOptions
 from articulate_ssl.losses.objective import ObjectiveOptions, paper_terms
 from articulate_ssl.network.options import NetworkOptions
@@ -134,3 +135,12 @@ def test_slots_are_taught_by_posed_parts_or_weight_them():
 
 def test_all_starts_are_the_networks_own_by_default():
     assert NetworkOptions().state_anchors is None
+
+
+@pytest.mark.parametrize(("recipe", "asked", "counted"), [("paper", None, 6), ("paper", 2, 2), ("staged", None, 1)])
+def test_several_points_of_a_part_say_how_near_it_is(recipe, asked, counted):
+    module = tiny_module(recipe=recipe, inference=InferenceOptions(part_neighbours=asked)).eval()
+    prediction = module.predict_points(clouds := _clouds(2), refine=False)
+    posed = transform_points(prediction.part_pose, prediction.part_shape)
+    distance = torch.cdist(clouds[:, None], posed).topk(counted, largest=False).values.mean(dim=-1)
+    assert (prediction.part_id == distance.argmin(dim=1)).float().mean() > 0.99
