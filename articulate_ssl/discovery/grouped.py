@@ -4,8 +4,9 @@ It is how people scan, and an easier problem than the paper's: no result of it b
 without its name. What is used is which recordings are of one object, no label.
 
 1. Of a few typical objects parts and joints are found from all their clouds (`one_object`).
-2. Each is brought into a category's shape and registered to some clouds (`registrar`); the one stays that explains them
-   best, and is registered to all.
+2. Each is brought into a category's shape and registered to some of the clouds that single-cloud discovery would see
+   (`registrar`), which are of as many objects as possible; the one stays that explains them best, and is registered to
+   all. Clouds of a few whole objects say less: one that the collection turns over is a large part of it.
 
 Descent on the whole category, which `discover` ends with, gives points to parts anew, and worse than an object's own
 clouds do: it took the template's labels from an IoU of .68 to .43 on chests, from .94 to .93 on laptops.
@@ -50,32 +51,34 @@ def refuse_views(observation: Observation) -> None:
 
 @flush_denormals()
 def discover_grouped(
-    clouds: Tensor,  # [n, N, 3] complete, in any orientation, those of one object in one scale
-    instance: Tensor,  # [n] which object each of them shows
+    clouds: Tensor,  # [n, N, 3] complete, in any orientation
+    scans: Tensor,  # [m, N, 3] the same of whole objects, those of one object in one scale
+    instance: Tensor,  # [m] which object each scan shows
     num_parts: int,
     joint_type: int,
     options: DiscoveryOptions,
 ) -> RegisteredShape:
-    """Parts and joints of the category, registered to all the clouds.
+    """Parts and joints of the category, registered to the clouds.
 
     Raises:
-        DiscoveryError: if no object has clouds enough, or the parts of none are found.
+        DiscoveryError: if no object has scans enough, or the parts of none are found.
     """
-    objects = choose_objects(clouds[:, : options.dense_points], instance, options.references, MIN_CLOUDS)
+    objects = choose_objects(scans[:, : options.dense_points], instance, options.references, MIN_CLOUDS)
     if not len(objects):
         raise DiscoveryError(
-            f"discovery.grouped needs an object with {MIN_CLOUDS} clouds or more among the {len(clouds)} of discovery; "
+            f"discovery.grouped needs an object with {MIN_CLOUDS} clouds or more among the {len(scans)} of discovery; "
             f"none has more than {int(instance.unique(return_counts=True)[1].max())}. Make more states of each object "
             '(`make data ... ARGS="--states 10"`), put all scans of an object into one folder (SOURCE=clouds), allow '
             "more --model.discovery.clouds, or leave grouped out"
         )
-    collection = Collection.of(clouds, joint_type, options, Observation())
-    registrar, candidates = collection.registrar, []
-    for number, one in enumerate(_announced(objects), start=1):
-        rows = (instance == one).nonzero().squeeze(-1)
-        rows = rows[torch.linspace(0, len(rows) - 1, min(len(rows), MOST_CLOUDS)).round().long()]
+    of_object = [_some((instance == one).nonzero().squeeze(-1)) for one in objects]
+    collection = Collection.of(torch.cat([clouds, scans[torch.cat(of_object)]]), joint_type, options, Observation())
+    registrar, candidates, last = collection.registrar, [], len(clouds)
+    for number, rows in enumerate(_announced(of_object), start=1):
+        first, last = last, last + len(rows)
+        frame = None if collection.frame is None else collection.frame[first:last]
         try:
-            template = _template(clouds[rows], collection, rows, num_parts, joint_type)
+            template = _template(scans[rows], frame, options, num_parts, joint_type)
         except DiscoveryError as error:
             log.warning("part discovery leaves object %d of %d out: %s", number, len(objects), error)
             continue
@@ -87,37 +90,41 @@ def discover_grouped(
             "parts and the type of joint, allow more --model.discovery.references, or leave grouped out"
         )
     found = registrar.register(min(candidates, key=lambda c: _error(c, options)), collection.clouds)
-    _announce(len(objects) + 1, objects, "done")
-    return collection.as_given(found)
+    _announce(len(objects) + 1, of_object, "done")
+    return collection.as_given(found).of_clouds(slice(len(clouds)))
+
+
+def _some(rows: Tensor) -> Tensor:
+    """At most `MOST_CLOUDS` of them, spread evenly."""
+    return rows[torch.linspace(0, len(rows) - 1, min(len(rows), MOST_CLOUDS)).round().long()]
 
 
 def _template(
-    clouds: Tensor,  # [m, N, 3] of one object
-    collection: Collection,
-    rows: Tensor,  # [m] which of the collection's they are
+    scans: Tensor,  # [m, N, 3] of one object
+    frame: Tensor | None,  # [m, 3, 3] that turn them into the frame of the collection, if it has one
+    options: DiscoveryOptions,
     num_parts: int,
     joint_type: int,
 ) -> RegisteredShape:
     """The object as a category's shape that stands as the collection does."""
-    options = collection.registrar.options
-    found = find_one_object(clouds.cpu(), num_parts, joint_type, options.dense_points, options.seed)
+    found = find_one_object(scans.cpu(), num_parts, joint_type, options.dense_points, options.seed)
     if not found.explained:
         raise DiscoveryError(
             f"{found.unexplained:.0%} of the points of its clouds lie off all its other clouds: not one object, or of "
             "different sizes"
         )
-    return as_template(found, options.dense_points, None if collection.frame is None else collection.frame[rows])
+    return as_template(found, options.dense_points, frame)
 
 
-def _announced(objects: Tensor) -> Iterator[int]:
-    """One object after the other, then the registration to all clouds."""
-    for number, one in enumerate(objects.tolist()):
+def _announced(objects: list[Tensor]) -> Iterator[Tensor]:
+    """The scans of one object after the other, then the registration to all clouds."""
+    for number, rows in enumerate(objects):
         _announce(number, objects, f"object {number + 1} of {len(objects)}")
-        yield one
+        yield rows
     _announce(len(objects), objects, "registration to all clouds")
 
 
-def _announce(done: int, objects: Tensor, name: str) -> None:
+def _announce(done: int, objects: list[Tensor], name: str) -> None:
     announce(log, Stage("discovery from objects", name, done, len(objects) + 1))
 
 

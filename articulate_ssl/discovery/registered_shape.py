@@ -48,6 +48,11 @@ class RegisteredShape:
         error = fit.error(clouds, softened=False)
         return RegisteredShape(fit.shape, fit.base, fit.state, fit.log_stretch, error, fit.axes)
 
+    def of_clouds(self, rows: Tensor | slice) -> RegisteredShape:
+        """The same for some of the clouds."""
+        own = {name: getattr(self, name)[rows] for name in ("base", "state", "log_stretch", "error")}
+        return replace(self, **own)
+
     def fit(self, generator: torch.Generator, rows: Tensor | slice = slice(None)) -> InstanceFit:
         """An instance fit to go on from here, on some of the clouds; stretches along principal axes start anew."""
         start = None if self.axes is None else self.log_stretch[rows]

@@ -40,8 +40,8 @@ _CATEGORY_RATE = 2.5
 class TrainingRecipe(Recipe):
     """Of every cloud the hypothesis that reconstructs it best trains; the learning rate decays in steps."""
 
-    # Either plate of a laptop has points beyond the hinge, where the nearest one decides nothing: mIoU .81 and .79 by the
-    # nearest point, .89 and .91 by three, .89 and .91 by six (two trainings; docs/experiments.md, step 65).
+    # Either plate of a laptop has points beyond the hinge, where the nearest one decides nothing: mIoU .81 and .79 by
+    # the nearest point, .89 and .91 by three, .89 and .91 by six (two trainings; docs/experiments.md, step 65).
     refines, part_neighbours = False, 6
 
     def __init__(self, *args) -> None:

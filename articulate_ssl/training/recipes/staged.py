@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -89,15 +88,12 @@ class TrainingRecipe(Recipe):
     ) -> None:
         """Part discovery."""
         options, network = self.discovery, self.estimator.articulated
-        if options.grouped:
-            dense, instance = objects(options.clouds)
-            find = partial(discover_grouped, dense, instance, network.num_parts, network.joint_type, options)
-        else:
-            dense = clouds(options.clouds)
-            observation = self.estimator.observation
-            find = partial(discover, dense, network.num_parts, network.joint_type, options, observation)
+        dense, category = clouds(options.clouds), (network.num_parts, network.joint_type, options)
         with torch.random.fork_rng(devices=[]), torch.no_grad():
-            found = find()
+            if options.grouped:
+                found = discover_grouped(dense, *objects(options.clouds), *category)
+            else:
+                found = discover(dense, *category, self.estimator.observation)
         kept = found.error.argsort()[: self.discovery.kept(len(dense))]
         self.found = HandOver(
             dense[kept, :num_points], found.base[kept], found.state[kept], found.log_stretch[kept], found.limits()

@@ -75,7 +75,7 @@ def test_an_object_is_registered_to_the_clouds_of_others(design, points, least, 
     with_coarse_slides(monkeypatch)
     world = World(design, points=points)
     monkeypatch.setattr(grouped, "find_one_object", world.found)
-    found = discover_grouped(world.points, world.instance, 2, design[4], SMALL)
+    found = discover_grouped(world.points, world.points, world.instance, 2, design[4], SMALL)
     turned = found.base[:, :3, :3].mT @ world.base[:, :3, :3]
     apart = roma.rotmat_geodesic_distance(turned[:, None], turned).rad2deg().median(dim=1).values
     right = apart < 20
@@ -91,7 +91,7 @@ def test_an_object_is_registered_to_the_clouds_of_others(design, points, least, 
 def test_objects_are_looked_for_in_all_of_their_clouds_and_no_other(monkeypatch, no_registration):
     world = World(LAPTOP)
     monkeypatch.setattr(grouped, "find_one_object", world.found)
-    discover_grouped(world.points, world.instance, 2, LAPTOP[4], TWO)
+    discover_grouped(world.points, world.points, world.instance, 2, LAPTOP[4], TWO)
     assert [world.instance[rows].unique().tolist() for rows in world.asked] == [[3], [7]]
     assert [len(rows.unique()) for rows in world.asked] == [8, 8]
 
@@ -101,7 +101,7 @@ def test_the_object_that_explains_most_stays(errors, size, monkeypatch, no_regis
     world = World(LAPTOP)
     monkeypatch.setattr(grouped, "find_one_object", world.found)
     no_registration += errors  # of object 3, the larger one, then of object 7
-    found = discover_grouped(world.points, world.instance, 2, LAPTOP[4], TWO)
+    found = discover_grouped(world.points, world.points, world.instance, 2, LAPTOP[4], TWO)
     pivot = found.shape.joints.pivot[0] - found.shape.points.mean(dim=0)
     own = as_template(world.found(world.points[world.instance == (3 if size > 1 else 7)], 2, 0, 0, 0), 256).shape
     torch.testing.assert_close(pivot, own.joints.pivot[0] - own.points.mean(dim=0))
@@ -118,7 +118,7 @@ def test_an_object_that_fails_is_left_out_with_a_word(monkeypatch, caplog, no_re
 
     monkeypatch.setattr(grouped, "find_one_object", found)
     with caplog.at_level(logging.WARNING, "articulate_ssl"):
-        found = discover_grouped(world.points, world.instance, 2, LAPTOP[4], TWO)
+        found = discover_grouped(world.points, world.points, world.instance, 2, LAPTOP[4], TWO)
     assert len(found.base) == 16
     assert [record.message for record in caplog.records] == ["part discovery leaves object 1 of 2 out: it was moving"]
 
@@ -132,7 +132,7 @@ def test_where_no_object_is_understood_it_is_said(monkeypatch, caplog):
 
     monkeypatch.setattr(grouped, "find_one_object", found)
     with pytest.raises(DiscoveryError, match="parts of none of 2 objects"):
-        discover_grouped(world.points, world.instance, 2, LAPTOP[4], TWO)
+        discover_grouped(world.points, world.points, world.instance, 2, LAPTOP[4], TWO)
     assert [record.message.count("100% of the points") for record in caplog.records] == [1, 1]
 
 
@@ -141,16 +141,16 @@ def test_objects_with_few_clouds_are_no_templates(monkeypatch, no_registration):
     instance = world.instance.clone()
     instance[(instance == 3).nonzero()[0]] = 5
     monkeypatch.setattr(grouped, "find_one_object", world.found)
-    discover_grouped(world.points, instance, 2, LAPTOP[4], TWO)
+    discover_grouped(world.points, world.points, instance, 2, LAPTOP[4], TWO)
     assert [instance[rows].unique().tolist() for rows in world.asked] == [[7]]
     with pytest.raises(DiscoveryError, match=r"none has more than 1\. Make more states .*--states 10.*one folder"):
-        discover_grouped(world.points, torch.arange(16), 2, LAPTOP[4], TWO)
+        discover_grouped(world.points, world.points, torch.arange(16), 2, LAPTOP[4], TWO)
 
 
 def test_of_many_clouds_of_an_object_some_are_looked_at(monkeypatch, no_registration):
     world = World(LAPTOP, count=20, points=128)
     monkeypatch.setattr(grouped, "find_one_object", world.found)
-    discover_grouped(world.points, world.instance, 2, LAPTOP[4], SMALL)
+    discover_grouped(world.points, world.points, world.instance, 2, LAPTOP[4], SMALL)
     assert len(world.asked[0].unique()) == MOST_CLOUDS
 
 

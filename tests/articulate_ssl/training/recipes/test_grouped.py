@@ -25,8 +25,8 @@ def seen(monkeypatch):
     """What discovery is given; what it finds is some shape."""
     calls = {}
 
-    def grouped(clouds, instance, *category):
-        calls["grouped"] = clouds, instance, *category
+    def grouped(clouds, scans, instance, *category):
+        calls["grouped"] = clouds, scans, instance, *category
         return _some_shape(clouds)
 
     def single(clouds, *rest):
@@ -63,12 +63,13 @@ def test_which_object_a_cloud_shows_reaches_discovery(tmp_path, seen, labelled):
     module = tiny_module(discovery=GROUPED)
     fit(module, tmp_path, 1)
     assert seen.keys() == {"grouped"}
-    clouds, instance, *category = seen["grouped"]
+    clouds, scans, instance, *category = seen["grouped"]
     assert category == [2, module.articulated.joint_type, GROUPED]
-    assert clouds.shape == (18, 128, 3) and clouds.dtype == torch.float32
-    assert torch.equal(instance, _object_of(tmp_path, clouds))
+    assert scans.shape == (18, 128, 3) and scans.dtype == torch.float32
+    assert torch.equal(instance, _object_of(tmp_path, scans))
     assert instance.unique(return_counts=True)[1].tolist() == [9, 9]  # whole objects
-    # Of these clouds, the three quarters that were registered best are handed over.
+    # Of the clouds that single-cloud discovery sees, the three quarters that were registered best are handed over.
+    assert len(_object_of(tmp_path, clouds).unique()) > 2
     assert torch.equal(module.recipe.found.points, clouds.flip(0)[:13, :POINTS])
 
 
