@@ -8,6 +8,8 @@ shape that is placed in the cloud by what every offset costs, and stretched, fit
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor, nn
 
@@ -22,8 +24,8 @@ from articulate_ssl.geometry.se3 import se3
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.joints import Joints
 
-# Of 150 clouds of unseen chests, the first turn was right for 88 % by 8 clouds, 90 % by 16, 88 to 91 % by 32, 95 % by
-# 192; of 75, the turn of the better fit for 40 % where the first was right for 71 % (docs/experiments.md, step 63).
+# Of 150 clouds of unseen chests, the first turn was right for 88 % by 8 clouds, 90 % by 16, 88 to 91 % by 32 and 95 %
+# by 192 (docs/experiments.md, step 63).
 _GALLERY, _GALLERY_POINTS = 32, 512
 _TURNS = 2  # the likeliest, and its rival
 _FITTED_POINTS = 1024  # of a cloud, to which the shape is fitted
@@ -33,6 +35,8 @@ _CYCLES = 4  # of the descent on every candidate; twice as many on the best
 
 class SlidingSearch(nn.Module):
     """Poses and joint states of an articulated shape whose parts slide, in clouds of any orientation.
+
+    It computes on the CPU, wherever its buffers are, because distance fields do.
 
     Attributes:
         gallery: [R, P, 3] training clouds in canonical orientation, stretched to boxes of width one; none before
@@ -59,16 +63,10 @@ class SlidingSearch(nn.Module):
         self,
         shape: ArticulatedShape,  # M points of every part in turn, in a frame common to the clouds
         limits: Tensor,  # [J, 2]
-        clouds: Tensor,  # [n, N, 3] training clouds, N >= 512
+        clouds: Tensor,  # [n, N, 3] training clouds
         base: Tensor,  # [n, 4, 4] canonical object space -> cloud
     ) -> None:
-        """Keep a shape, and some of the clouds it was found in, spread evenly.
-
-        Raises:
-            ValueError: if the clouds have too few points.
-        """
-        if clouds.shape[1] < _GALLERY_POINTS:
-            raise ValueError(f"{_GALLERY_POINTS} points of a cloud are compared, these have {clouds.shape[1]}")
+        """Keep a shape, and some of the clouds it was found in, spread evenly."""
         some = torch.linspace(0, len(clouds) - 1, min(len(clouds), _GALLERY)).round().long()
         boxes, _, _ = unit_boxes(clouds[some] @ base[some, :3, :3])
         self.gallery = boxes[:, :_GALLERY_POINTS].contiguous()
@@ -80,14 +78,14 @@ class SlidingSearch(nn.Module):
     @torch.no_grad()
     def turns(
         self,
-        clouds: Tensor,  # [B, N, 3] with all their points
+        clouds: Tensor,  # [B, N, 3] with all their points, on the CPU
     ) -> tuple[Tensor, Tensor]:  # [B, 2, 3, 3], [B, 2]
         """Rotations cloud -> canonical orientation, the likeliest two, and their distances to the gallery."""
         rotation, _ = manhattan_frames(clouds, torch.Generator().manual_seed(0))
         boxes, _, _ = unit_boxes(clouds @ rotation.mT)
         group = rotation_group(24).elements.to(clouds)
         # What is g @ box in canonical orientation lies in the box where the inverse of g puts it.
-        turned = torch.einsum("gji,rpj->grpi", group, self.gallery.to(clouds))
+        turned = torch.einsum("gji,rpj->grpi", group, self.gallery.cpu())
         found, costs = [], []
         for box, frame in zip(boxes, rotation, strict=True):
             cost = DistanceFields.of(box[None]).at(0, turned).clamp(max=CAP).mean(dim=(1, 2))
@@ -108,19 +106,24 @@ class SlidingSearch(nn.Module):
             The shapes of 2 B candidates, stretched to the clouds' proportions (points [2 B, K M, 3]), their base poses
             [B, 2, 4, 4] and joint states [B, 2, J], and how far the clouds are from the gallery [B, 2].
         """
+        device, clouds = clouds.device, clouds.cpu()
         turn, cost = self.turns(clouds)
         copies = torch.einsum("bcij,bnj->bcni", turn, clouds[:, :_FITTED_POINTS]).flatten(0, 1)
         axes = torch.eye(3).to(clouds).expand(len(self.points), 3, 3)
         generator = torch.Generator().manual_seed(0)
         fit = fit_slides(self._shape(chain), axes, copies, _PLACED_POINTS, _CYCLES, generator)
         back = se3(turn.mT, turn.new_zeros(*turn.shape[:2], 3))
-        base, state = (value.unflatten(0, turn.shape[:2]) for value in (fit.base, fit.state))
-        return fit.instances(), back @ base, state, cost
+        base, state = (value.unflatten(0, turn.shape[:2]).to(device) for value in (fit.base, fit.state))
+        found = fit.instances()
+        joints = found.joints
+        lines = {name: getattr(joints, name).to(device) for name in ("axis", "pivot", "limits")}
+        found = ArticulatedShape(found.points.to(device), found.label.to(device), replace(joints, **lines))
+        return found, back.to(device) @ base, state, cost.to(device)
 
     def _shape(self, chain: KinematicChain) -> ArticulatedShape:
-        label = torch.arange(len(self.points), device=self.points.device).repeat_interleave(self.points.shape[1])
-        joints = Joints(chain, self.axis, self.pivot, PRISMATIC, self.limits)
-        return ArticulatedShape(self.points.flatten(0, 1), label, joints)
+        points, axis, pivot, limits = (value.cpu() for value in (self.points, self.axis, self.pivot, self.limits))
+        label = torch.arange(len(points)).repeat_interleave(points.shape[1])
+        return ArticulatedShape(points.flatten(0, 1), label, Joints(chain, axis, pivot, PRISMATIC, limits))
 
     def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
         """The gallery has any size; weights from before there was a search have none."""

@@ -93,9 +93,12 @@ def test_weights_from_before_there_was_a_search_have_none(learnt):
     assert not search.learnt
 
 
-def test_too_few_points_are_refused(learnt):
-    with pytest.raises(ValueError, match="512 points"):
-        learnt.learn(_shape(_chests(1, seed=0)), LIMITS, torch.rand(4, 100, 3), torch.eye(4).expand(4, 4, 4))
+def test_clouds_of_few_points_will_do(learnt):
+    data = _chests(8, seed=0)
+    search = SlidingSearch(3, 200)
+    search.learn(_shape(data), LIMITS, data.points[:, :300], data.base)
+    assert search.learnt
+    torch.testing.assert_close(search.turns(data.points)[0][:, 0], learnt.turns(data.points)[0][:, 0])
 
 
 def test_the_search_competes_with_the_network(learnt):
