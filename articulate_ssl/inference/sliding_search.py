@@ -95,6 +95,7 @@ class SlidingSearch(nn.Module):
         return torch.stack(found), torch.stack(costs)
 
     @torch.no_grad()
+    @torch.inference_mode(mode=False)  # the fit descends
     def search(
         self,
         chain: KinematicChain,
@@ -106,7 +107,7 @@ class SlidingSearch(nn.Module):
             The shapes of 2 B candidates, stretched to the clouds' proportions (points [2 B, K M, 3]), their base poses
             [B, 2, 4, 4] and joint states [B, 2, J], and how far the clouds are from the gallery [B, 2].
         """
-        device, clouds = clouds.device, clouds.cpu()
+        device, clouds = clouds.device, clouds.cpu().clone()  # a normal tensor, also where it was none
         turn, cost = self.turns(clouds)
         copies = torch.einsum("bcij,bnj->bcni", turn, clouds[:, :_FITTED_POINTS]).flatten(0, 1)
         axes = torch.eye(3).to(clouds).expand(len(self.points), 3, 3)

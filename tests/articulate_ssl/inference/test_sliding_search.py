@@ -113,7 +113,8 @@ def test_the_search_competes_with_the_network(learnt):
     points = data.points[:, :256]
     without = estimator.predict(points, 256, dense=data.points)
     estimator.sliding.load_state_dict(learnt.state_dict())
-    found = estimator.predict(points, 256, dense=data.points)
+    with torch.inference_mode():  # as a trainer tests
+        found = estimator.predict(points.clone(), 256, dense=data.points.clone())
     alone = estimator.search(points, torch.zeros(2, 2), data.points)
     truth = data.base[:, :3, :3]
     for prediction in (found, alone):
