@@ -15,7 +15,7 @@ Training takes the first two steps too; nothing here knows a loss or an optimise
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -29,9 +29,7 @@ from articulate_ssl.discovery.search import search_articulated
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
-from articulate_ssl.inference.confidence import relative_error
-from articulate_ssl.inference.point_cloud_io import normalise_cloud
-from articulate_ssl.inference.prediction import Prediction, ScanEstimate, concatenate
+from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.inference.relief import NUM_FEATURES, describe_relief
 from articulate_ssl.inference.sliding_search import SlidingSearch
 from articulate_ssl.inference.two_ways import TwoWays
@@ -46,12 +44,8 @@ from articulate_ssl.shape.observation import Observation
 from articulate_ssl.shape.stretch import principal_directions
 
 _ANOTHER_WAY = math.radians(30)  # beyond, one of two hypotheses is wrong (`metrics.above_30_rate`)
-# Standard deviations, over the training clouds, by which the scale of a scan may differ from their mean.
-_SCALE_STARTS = (-1.5, -0.75, 0.0, 0.75, 1.5)
 _SIDE = 1 / 3  # of the width of a joint's range, from its middle, where a search without a network starts, too
 _AGREEING_POINTS = 64  # of a cloud, farthest-point order: which way round its parts are shows in few
-_DENSE_POINTS = 4096  # of a scan: as many as a generated cloud has
-_SCANS_AT_ONCE = 16  # bounds the memory; each is a cloud per start
 
 
 @dataclass(frozen=True)
@@ -439,68 +433,6 @@ class PoseEstimator:
             found, _, margin = self._best(candidates)
             return self._prediction(found, points, margin)
 
-    def predict_scans(
-        self,
-        clouds: Sequence[np.ndarray],  # each [N, 3], any unit, origin and number of points
-        num_points: int,
-        radius: tuple[float, float],
-        refine: bool | None = None,
-    ) -> list[ScanEstimate]:
-        """Predict scans of unknown scale: of several within the training clouds' range, the best reconstruction wins.
-
-        `_SCANS_AT_ONCE` go through networks and registration together, and one's prediction does not depend on others.
-
-        Args:
-            num_points: See `predict`; registration reads as many as the options say.
-            radius: Mean and standard deviation, over normalised training clouds, of the points' mean distance to their
-                centre.
-        """
-        mean, spread = radius
-        starts = [mean + shift * spread for shift in _SCALE_STARTS]
-        estimates = []
-        for first in range(0, len(clouds), _SCANS_AT_ONCE):
-            estimates += self._predict_together(clouds[first : first + _SCANS_AT_ONCE], num_points, starts, refine)
-        return estimates
-
-    def _predict_together(
-        self,
-        clouds: Sequence[np.ndarray],  # each [N, 3]
-        num_points: int,
-        starts: list[float],  # S mean distances to the centre that each is tried with
-        refine: bool | None,
-    ) -> list[ScanEstimate]:
-        device = self.articulated.category.template.device
-        centers, scales, tried = [], [], []
-        for points in clouds:
-            cloud, center, _ = normalise_cloud(points, max(num_points, self.inference.points), scale=1.0)
-            size = float(np.linalg.norm(np.asarray(points, dtype=np.float64) - center, axis=1).mean())
-            centers.append(center)
-            scales.append([size / start for start in starts])
-            tried += [torch.as_tensor(cloud / scale, dtype=torch.float32) for scale in scales[-1]]
-        batch = torch.stack(tried).to(device)
-        if self.sliding.learnt:
-            every = zip(clouds, centers, scales, batch.split(len(starts)), strict=True)
-            found = [
-                self.predict_with_rivals(some, num_points, refine, _scaled(points, center, scale).to(batch))
-                for points, center, scale, some in every
-            ]
-            prediction, rival = (concatenate(list(several)) for several in zip(*found, strict=True))
-        else:
-            prediction, rival = self.predict_with_rivals(batch, num_points, refine)
-        best = relative_error(prediction, batch).view(-1, len(starts)).argmin(dim=1)
-        rows = torch.arange(len(clouds), device=best.device) * len(starts) + best
-        batch, prediction, rival = batch[rows], prediction[rows], rival[rows]
-        scales = [scale[start] for scale, start in zip(scales, best.tolist(), strict=True)]
-        estimates = []
-        for i, (points, center, scale) in enumerate(zip(clouds, centers, scales, strict=True)):
-            one, other = prediction[i : i + 1], rival[i : i + 1]
-            if self.two_ways.learnt:
-                dense = _scaled(points, center, [scale]).to(batch)
-                one, other = self.predict_with_rivals(batch[i : i + 1], num_points, refine, dense)
-            other = other if one.margin < 1 else None
-            estimates.append(ScanEstimate(one, other, batch[i].cpu().numpy(), center, scale))
-        return estimates
-
     def _refine(self, last: Iteration, points: Tensor) -> tuple[Hypotheses, Tensor]:
         """The leading hypotheses after articulated registration of the predicted shape, and their errors."""
         options, hypotheses = self.inference, last.hypotheses
@@ -549,14 +481,3 @@ def _joint_lines(
     parent_pose = pose[:, list(one.chain.parent)]
     axis = (parent_pose[..., :3, :3] @ one.axis[:, 0, ..., None]).squeeze(-1)
     return axis, transform_points(parent_pose, one.pivot[:, :, None])[:, :, 0]
-
-
-def _scaled(
-    points: np.ndarray,  # [N, 3] of a scan
-    center: np.ndarray,  # [3]
-    scales: list[float],
-) -> Tensor:  # [S, P, 3]
-    """At most as many points as a generated cloud has, in several scales; drawn, since their density says something."""
-    chosen = np.random.default_rng(0).permutation(len(points))[:_DENSE_POINTS]
-    offset = np.asarray(points)[chosen] - center
-    return torch.from_numpy(np.stack([offset / scale for scale in scales]))

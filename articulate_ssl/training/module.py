@@ -25,6 +25,7 @@ from articulate_ssl.inference.checkpoint_file import CHECKPOINT_KEY
 from articulate_ssl.inference.confidence import Confidence, relative_error
 from articulate_ssl.inference.pose_estimation import InferenceOptions, PoseEstimator
 from articulate_ssl.inference.prediction import Prediction, ScanEstimate
+from articulate_ssl.inference.scan_scales import predict_scans
 from articulate_ssl.losses.objective import ObjectiveOptions, rigid_loss
 from articulate_ssl.metrics.report import MULTI_STATE
 from articulate_ssl.network.articulated_network import ArticulatedNetwork
@@ -158,9 +159,9 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         clouds: Sequence[np.ndarray],  # each [N, 3], any unit and origin
         refine: bool | None = None,
     ) -> list[ScanEstimate]:
-        """Predict scans of unknown scale: see `PoseEstimator.predict_scans`."""
+        """Predict scans of unknown scale: see `inference.scan_scales`."""
         radius = float(self.radius.mean), float(self.radius.spread)
-        estimates = self.estimator.predict_scans(clouds, self.num_points, radius, refine)
+        estimates = predict_scans(self.estimator, clouds, self.num_points, radius, refine)
         return [self._with_confidence(estimate) for estimate in estimates] if self.confidence.learnt else estimates
 
     def _with_confidence(self, estimate: ScanEstimate) -> ScanEstimate:

@@ -10,6 +10,7 @@ from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.geometry.screw import PRISMATIC
 from articulate_ssl.geometry.se3 import se3, transform_points
 from articulate_ssl.inference.pose_estimation import InferenceOptions, PoseEstimator
+from articulate_ssl.inference.scan_scales import predict_scans
 from articulate_ssl.inference.sliding_search import SlidingSearch
 from articulate_ssl.network.articulated_network import ArticulatedNetwork
 from articulate_ssl.network.options import NetworkOptions
@@ -101,15 +102,33 @@ def test_clouds_of_few_points_will_do(learnt):
     torch.testing.assert_close(search.turns(data.points)[0][:, 0], learnt.turns(data.points)[0][:, 0])
 
 
-def test_the_search_competes_with_the_network(learnt):
+def _estimator(data: Clouds) -> PoseEstimator:
+    """With a network that has learnt nothing."""
     options = NetworkOptions(
         group_order=12, dims=(8, 8, 8), num_neighbors=8, num_centers=(128, 64, 32), head_dim=8, shape_points=200
     )
     torch.manual_seed(0)
     network = ArticulatedNetwork(options, 3, PRISMATIC).eval()
     estimator = PoseEstimator(network, None, 1, Observation(), 0.05, InferenceOptions(refine=True))
-    data = _chests(2, seed=4)
     network.category.adopt(_shape(data))
+    return estimator
+
+
+def test_scans_of_any_scale_and_number_of_points_are_searched(learnt):
+    data = _chests(2, seed=4)
+    estimator = _estimator(data)
+    estimator.sliding.load_state_dict(learnt.state_dict())
+    radius = float((data.points - data.points.mean(dim=1, keepdim=True)).norm(dim=-1).mean())
+    scans = [700 * data.points[0].numpy() + 5, data.points[1, :1500].numpy()]
+    for estimate, base in zip(predict_scans(estimator, scans, 256, (radius, 0.01)), data.base, strict=True):
+        found = estimate.prediction.base_pose[0, :3, :3]
+        assert roma.rotmat_geodesic_distance(found, base[:3, :3]).rad2deg() < 5
+        assert estimate.rival is not None
+
+
+def test_the_search_competes_with_the_network(learnt):
+    data = _chests(2, seed=4)
+    estimator = _estimator(data)
     points = data.points[:, :256]
     without = estimator.predict(points, 256, dense=data.points)
     estimator.sliding.load_state_dict(learnt.state_dict())

@@ -11,7 +11,7 @@ from tiny import fit, tiny_module
 
 import articulate_ssl
 from articulate_ssl import ArticulatedPoseEstimator, ArticulatedPoseModule, ScanPrediction, load
-from articulate_ssl.inference import pose_estimation
+from articulate_ssl.inference import scan_scales
 from articulate_ssl.inference.checkpoint_file import CheckpointError
 from articulate_ssl.inference.pose_estimation import PoseEstimator
 from articulate_ssl.pretrained.estimator import EstimatorChoice
@@ -79,11 +79,11 @@ def test_a_batch_goes_through_together_and_is_predicted_as_one_by_one(folder, cl
     sizes, predict = [], PoseEstimator.predict_with_rivals
 
     def counted(self, points, *arguments):
-        sizes.append(len(points) // len(pose_estimation._SCALE_STARTS))
+        sizes.append(len(points) // len(scan_scales.SCALE_STARTS))
         return predict(self, points, *arguments)
 
     monkeypatch.setattr(PoseEstimator, "predict_with_rivals", counted)
-    monkeypatch.setattr(pose_estimation, "_SCANS_AT_ONCE", 3)
+    monkeypatch.setattr(scan_scales, "_SCANS_AT_ONCE", 3)
     for batched, single in zip(estimator.predict_batch(clouds), alone, strict=True):
         np.testing.assert_array_equal(batched.part_id, single.part_id)
         np.testing.assert_allclose(batched.states, single.states, atol=1e-4)
