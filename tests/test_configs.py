@@ -18,7 +18,16 @@ from render.category import category_names, load_category
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 CATEGORIES = ("desk_lamp", "drawer", "eyeglasses", "laptop", "laptop_real", "oven", "safe", "washing_machine")
-PROFILES = ((), ("cpu",), ("gpu",), ("paper",), ("cpu", "smoke"), ("cpu", "depth_camera"), ("cpu", "paper_recipe"))
+PROFILES = (
+    (),
+    ("cpu",),
+    ("gpu",),
+    ("paper",),
+    ("cpu", "smoke"),
+    ("cpu", "depth_camera"),
+    ("cpu", "paper_recipe"),
+    ("cpu", "multi_state"),
+)
 
 
 @pytest.fixture(autouse=True)

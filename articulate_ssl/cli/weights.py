@@ -74,12 +74,17 @@ def _list(_args: argparse.Namespace) -> int:
     headings = (Column(heading, no_wrap=True) for heading in ("weights", "MB", *_HEADINGS))
     # 80 columns hold no lines between them.
     table = Table(*headings, title="means over test clouds", box=None, pad_edge=False)
+    named: dict[str, list[str]] = {}
     for weights in shipped_weights():
         card = WeightsCard.load(weights.file.with_suffix(CARD_SUFFIX))
+        if card.setting is not None:
+            named.setdefault(card.setting, []).append(weights.name)
         means = (card.metrics[name]["mean"] for name in HEADLINES)
         cells = ("-" if mean is None else _short(mean) for mean in means)
         table.add_row(weights.name, f"{weights.file.stat().st_size / 1e6:.1f}", *cells)
     Console().print(table)
+    for setting, names in named.items():
+        print(f"{setting} (training knew which clouds show the same object): {', '.join(names)}")
     return 0
 
 

@@ -19,7 +19,7 @@ import torch
 import yaml
 
 from articulate_ssl.inference.checkpoint_file import CheckpointError
-from articulate_ssl.metrics.report import JSON_NAME
+from articulate_ssl.metrics.report import JSON_NAME, MULTI_STATE
 from articulate_ssl.training.checkpoint import load_module
 from articulate_ssl.training.module import ArticulatedPoseModule
 from articulate_ssl.training.self_agreement import look_twice
@@ -35,6 +35,7 @@ PROFILES = {
     "complete": ("configs/profiles/cpu.yaml",),
     "depth": ("configs/profiles/cpu.yaml", "configs/profiles/depth_camera.yaml"),
 }
+MULTI_STATE_PROFILE = "configs/profiles/multi_state.yaml"
 _PLACES = {("data", "root"), ("trainer", "default_root_dir")}  # options that say where, not what
 _KEPT_COUNTS = ("samples", "instances", "failures")
 
@@ -73,7 +74,8 @@ def pack(
     view = VIEW_OF_DATA[manifest.view]
     if not metrics["category"] == module.category == manifest.category:
         raise CheckpointError(f"{metrics_json}: of {metrics['category']}, but the checkpoint is of {module.category}")
-    command = fit_command(module.category, view, int(config["seed_everything"]))
+    setting = metrics.get("setting")
+    command = fit_command(module.category, view, int(config["seed_everything"]), setting == MULTI_STATE)
     _refuse_other_options(metrics_json, config, command)
     _learn_confidence(module, data)
     weights = ShippedWeights(module.category, view, folder / f"{module.category}-{view}{SUFFIX}")
@@ -91,6 +93,7 @@ def pack(
         metrics={name: metrics[name] for name in (*HEADLINES, *_KEPT_COUNTS)},
         weaknesses=weaknesses(metrics, list(manifest.part_names), view),
         date=date.fromtimestamp(metrics_json.stat().st_mtime).isoformat(),
+        setting=setting,
     )
     folder.mkdir(parents=True, exist_ok=True)
     write_weights(module, weights.file)
@@ -110,9 +113,9 @@ def newest_metrics(run: Path) -> Path:
     return found[-1]
 
 
-def fit_command(category: str, view: str, seed: int) -> list[str]:
+def fit_command(category: str, view: str, seed: int, multi_state: bool = False) -> list[str]:
     """What trains the weights of a category and view, as a person types it (but for where things lie)."""
-    files = (f"configs/{category}.yaml", *PROFILES[view])
+    files = (f"configs/{category}.yaml", *PROFILES[view], *((MULTI_STATE_PROFILE,) if multi_state else ()))
     return ["lightning", "fit", *(word for file in files for word in ("-c", file)), "--seed_everything", str(seed)]
 
 

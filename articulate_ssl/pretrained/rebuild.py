@@ -31,6 +31,9 @@ DEPTH_OPTIONS = ("--states", "30", "--views", "4")  # more states and views teac
 # Objects teach more than states: which plate is a laptop's base was decided rightly for 84 % of the clouds of unseen
 # laptops by 800 clouds of 300 objects, for 97 % by 600 clouds of as many objects (docs/experiments.md, step 64).
 COMPLETE_OPTIONS = ("--train-instances", "1000", "--test-instances", "100", "--states", "3", "--rotations", "1")
+# Where parts are not found from single clouds, but from several of one object (docs/experiments.md, step 71).
+MULTI_STATE = (("drawer", "complete"), ("washing_machine", "complete"), ("desk_lamp", "complete"))
+MULTI_STATE_OPTIONS = ("--train-instances", "200", "--test-instances", "60", "--states", "10", "--rotations", "1")
 
 
 @dataclass(frozen=True)
@@ -68,16 +71,26 @@ class Rebuild:
         """Of its own, so that it can be deleted alone."""
         return self.place / "data"
 
+    @property
+    def _data_options(self) -> tuple[str, ...]:
+        if self.multi_state:
+            return MULTI_STATE_OPTIONS
+        return DEPTH_OPTIONS if self.view == "depth" else COMPLETE_OPTIONS
+
+    @property
+    def multi_state(self) -> bool:
+        """Whether training is told which clouds show the same object."""
+        return (self.category, self.view) in MULTI_STATE
+
     def stages(self) -> tuple[Stage, ...]:
         """The programs, in their order."""
         view = next(data_view for data_view, view in VIEW_OF_DATA.items() if view == self.view)
-        options = DEPTH_OPTIONS if self.view == "depth" else COMPLETE_OPTIONS
-        made = ("--category", self.category, "--view", view, "--seed", str(DATA_SEED), "--workers", "1", *options)
-        _, fit, *learn = fit_command(self.category, self.view, FIT_SEED)
+        made = ("--category", self.category, "--view", view, "--seed", str(DATA_SEED), "--workers", "1")
+        _, fit, *learn = fit_command(self.category, self.view, FIT_SEED, self.multi_state)
         places = ("--data.root", str(self.data_root), "--trainer.default_root_dir", str(self.place / "run"))
-        ours = (sys.executable, "-m", "articulate_ssl.cli")
+        make, ours = ("-m", "render.generate"), (sys.executable, "-m", "articulate_ssl.cli")
         return (
-            Stage("data", (sys.executable, "-m", "render.generate", *made, "--out", str(self.data_root))),
+            Stage("data", (sys.executable, *make, *made, *self._data_options, "--out", str(self.data_root))),
             Stage("fit", (*ours, fit, *learn, *places, "--trainer.enable_progress_bar", "false")),
             Stage("test", (*ours, "test", *learn, *places, "--trainer.enable_progress_bar", "false")),
         )

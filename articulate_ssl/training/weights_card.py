@@ -41,6 +41,7 @@ class WeightsCard:
         weaknesses: What they are bad at, in sentences.
         date: Day on which they were tested, ISO 8601.
         licence: SPDX identifier.
+        setting: `multi-state` if it was known in training which clouds show the same object; None for single clouds.
     """
 
     category: str
@@ -52,6 +53,7 @@ class WeightsCard:
     weaknesses: list[str]
     date: str
     licence: str = LICENCE
+    setting: str | None = None
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the card as JSON, whole or not at all."""
@@ -80,6 +82,7 @@ class WeightsCard:
             "",
             f"Parts: {', '.join(self.part_names)}. Trained without labels; licence {self.licence}; {self.date}.",
             "",
+            *self._about_setting(),
             f"Data (seed {self.data['seed']}, {self.data['train_instances']} training and "
             f"{self.data['test_instances']} test objects):",
             "",
@@ -105,6 +108,15 @@ class WeightsCard:
             *(f"- {weakness}" for weakness in self.weaknesses),
         ]
         return "\n".join(lines) + "\n"
+
+    def _about_setting(self) -> list[str]:
+        if self.setting is None:
+            return []
+        return [
+            f"Setting: {self.setting}. Training knew which clouds show the same object, which is easier than the "
+            "paper's single clouds. A prediction needs one cloud.",
+            "",
+        ]
 
 
 def hub_card(category: str, card: WeightsCard | None) -> str:

@@ -1,5 +1,6 @@
 """`articulate-ssl weights …` as it is typed."""
 
+import json
 import shutil
 
 import pytest
@@ -31,6 +32,13 @@ def test_packed_weights_are_listed_and_shown(package, capsys):
     assert main(["weights", "show", "laptop"]) == 0
     out = capsys.readouterr().out
     assert "# laptop, complete clouds" in out and "commit abc" in out
+
+
+def test_a_list_names_what_was_trained_in_another_setting(package, capsys):
+    card = package / "laptop-complete.json"
+    card.write_text(json.dumps(json.loads(card.read_text()) | {"setting": "multi-state"}))
+    assert main(["weights", "list"]) == 0
+    assert "multi-state (training knew which clouds show the same object): laptop-complete" in capsys.readouterr().out
 
 
 def test_unknown_weights_exit_2_with_one_line(package, capsys):

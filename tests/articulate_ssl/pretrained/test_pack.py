@@ -46,7 +46,7 @@ def test_weights_and_card_of_a_run_are_packed(run, tmp_path):
         "steps": 1000,
         "commit": "abc",
     }
-    assert card.metrics["r_err_deg"] == made_up_metrics()["r_err_deg"]
+    assert card.metrics["r_err_deg"] == made_up_metrics()["r_err_deg"] and card.setting is None
     for words in ("abc", "16 clouds of 4 objects", card.data["command"], *card.weaknesses):
         assert words in card.markdown()
 
@@ -70,6 +70,20 @@ def test_a_run_with_other_options_gets_no_card(run, tmp_path):
     assert not (tmp_path / "weights").exists()
 
 
+def test_the_multi_state_setting_is_on_the_card(run, tmp_path):
+    """Read from the metrics; a configuration that does not fit them is refused."""
+    file = newest_metrics(run)
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"setting": "multi-state"}))
+    with pytest.raises(CheckpointError, match=r"model\.discovery\.grouped is None, not True"):
+        pack(file, folder=tmp_path / "weights")
+    config = yaml.safe_load(file.with_name("config.yaml").read_text())
+    config["model"]["discovery"] = {"grouped": True}
+    file.with_name("config.yaml").write_text(yaml.safe_dump(config))
+    card = WeightsCard.load(pack(file, folder=tmp_path / "weights").file.with_suffix(".json"))
+    assert card.setting == "multi-state" and "-c configs/profiles/multi_state.yaml" in card.training["command"]
+    assert "multi-state. Training knew" in card.markdown()
+
+
 def test_metrics_of_another_category_are_refused(run, tmp_path):
     file = newest_metrics(run)
     file.write_text(json.dumps(json.loads(file.read_text()) | {"category": "oven"}))
@@ -84,8 +98,8 @@ def test_a_run_without_a_test_is_refused(run):
 
 
 def test_every_file_that_a_command_names_exists():
-    for view in ("complete", "depth"):
-        words = fit_command("washing_machine", view, 0)
+    for options in (("complete", 0), ("depth", 0), ("complete", 0, True)):
+        words = fit_command("washing_machine", *options)
         assert all((ROOT / word).is_file() for word in words if word.endswith(".yaml"))
 
 

@@ -11,9 +11,18 @@ from pathlib import Path
 
 import pytest
 
+from articulate_ssl.discovery.one_object.find import MIN_CLOUDS
 from articulate_ssl.pretrained import rebuild as module
 from articulate_ssl.pretrained import stages
-from articulate_ssl.pretrained.rebuild import CATEGORIES, Rebuild, Stage, StageFailed, commit_of, rebuild
+from articulate_ssl.pretrained.rebuild import (
+    CATEGORIES,
+    MULTI_STATE,
+    Rebuild,
+    Stage,
+    StageFailed,
+    commit_of,
+    rebuild,
+)
 from render.generate import _parser
 
 
@@ -143,6 +152,15 @@ def test_every_command_is_one_that_its_program_takes(tmp_path, category, view):
     assert options.category == category and options.view == {"complete": "complete", "depth": "partial"}[view]
     assert [stage.command[3] for stage in (fit, test)] == ["fit", "test"]
     assert fit.command[4:] == test.command[4:]
+
+
+def test_objects_in_the_multi_state_setting_have_clouds_enough(tmp_path):
+    """And nothing but the setting makes a difference between categories."""
+    for category, view in MULTI_STATE:
+        data, fit, _ = Rebuild(category, view, tmp_path).stages()
+        assert _parser().parse_args(data.command[3:]).states >= MIN_CLOUDS
+        assert "configs/profiles/multi_state.yaml" in fit.command
+    assert "configs/profiles/multi_state.yaml" not in Rebuild("laptop", "complete", tmp_path).stages()[1].command
 
 
 def test_the_commit_is_that_of_the_folder(tmp_path):
