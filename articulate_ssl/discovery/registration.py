@@ -1,8 +1,9 @@
 """Registration of a shape to point clouds by soft correspondences: rigid, part by part, and articulated.
 
 A soft correspondence is a Gaussian responsibility, as in coherent point drift; correspondences are formed in both
-directions, so that a shape covers the cloud as well as lying on it. Clouds never interact: every function treats its
-leading axis as independent problems.
+directions, so that a shape covers the cloud as well as lying on it. Where clouds do not show all sides of a shape, they
+are formed from the cloud to the shape only: nothing pulls at hidden points. Clouds never interact: every function
+treats its leading axis as independent problems.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ _BATCH_ENTRIES = 2**22  # entries of one responsibility matrix
 
 # What turns a part about an axis by so little (a thin rod about its length) is noise: such a rotation stays as it was.
 _INERTIA = 0.02
+# Weight with which points of the shape hold their place, where nothing else holds them.
+_HELD = 1e-4
 
 
 def chamfer_l1(
@@ -41,15 +44,20 @@ def update_poses(
     pose: Tensor,  # [n, K, 4, 4]
     clouds: Tensor,  # [n, N, 3]
     scale: float,  # standard deviation of the correspondence kernel
+    bidirectional: bool = True,
 ) -> Tensor:  # [n, K, 4, 4]
     """One round of soft-correspondence registration of every part on its own (weighted Kabsch)."""
     weights, targets = [], []
     for cloud, posed in _batches(clouds, shape.moved(pose)):
         logits = _squared_distances(cloud, posed).mul_(-1 / (2 * scale**2))
-        explain, attract = logits.softmax(dim=2), logits.softmax(dim=1)
-        weight = explain.sum(dim=1) + 1.0
+        explain = logits.softmax(dim=2)
+        weight = explain.sum(dim=1) + (1.0 if bidirectional else _HELD)
+        if bidirectional:
+            pulled = explain.add_(logits.softmax(dim=1)).transpose(1, 2) @ cloud
+        else:
+            pulled = explain.transpose(1, 2) @ cloud + _HELD * posed
         weights.append(weight)
-        targets.append((explain.add_(attract).transpose(1, 2) @ cloud) / weight[..., None])
+        targets.append(pulled / weight[..., None])
     weight, target = torch.cat(weights), torch.cat(targets)
     points = shape.points.expand(len(clouds), -1, 3)
     poses = []
@@ -102,12 +110,15 @@ def register_articulated(
     Every round moves each part freely, reads the joint states off the relative motions, and moves the articulated whole
     rigidly onto where the parts went.
 
+    Args:
+        bidirectional: The clouds show all sides of the shape, so that each of its points must be near them, too.
+
     Returns:
         Base poses [n, 4, 4], joint states [n, J], Chamfer-L1 errors [n].
     """
     still = torch.eye(4, dtype=base.dtype, device=base.device).expand_as(base)
     for scale in _annealed(scales, rounds):
-        free = update_poses(shape, shape.joints.part_pose(base, state), clouds, scale)
+        free = update_poses(shape, shape.joints.part_pose(base, state), clouds, scale, bidirectional)
         state = shape.read_states(free)
         base = se3(*roma.rigid_points_registration(shape.posed(still, state), shape.moved(free)))
     return base, state, chamfer_l1(clouds, shape.posed(base, state), bidirectional)

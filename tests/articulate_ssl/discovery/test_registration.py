@@ -65,6 +65,18 @@ def test_a_rod_keeps_its_roll():
     assert _degrees(pose[:, 0], turn.expand(8, 3, 3)) < 3
 
 
+def test_hidden_points_pull_at_nothing():
+    """Of laptops cut in two more than half is seen: registered in both directions, all of it is drawn onto that."""
+    data = clouds(LAPTOP)
+    shape = true_shape(LAPTOP, data)
+    seen = torch.stack([cloud[cloud[:, 0].argsort()[: 3 * len(cloud) // 5]] for cloud in data.points])
+    start = data.base @ _jitter(len(data.base), 5, 0.02), data.state + 0.1
+    base, state, _ = register_articulated(shape, seen, *start, (0.06, 0.01), 12, bidirectional=False)
+    assert _degrees(base, data.base) < 0.5 and (state - data.state).abs().max() < 0.01
+    base, state, _ = register_articulated(shape, seen, *start, (0.06, 0.01), 12)
+    assert _degrees(base, data.base) > 20
+
+
 def test_clouds_do_not_interact():
     data = clouds(GLASSES, count=4)
     shape = true_shape(GLASSES, data)
