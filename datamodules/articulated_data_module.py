@@ -57,6 +57,8 @@ class ArticulatedDataModule(LightningDataModule):
         dense_in_fit: Deliver the dense arrays in training and validation too.
         calibration_set: Folder of the set whose training clouds calibrate metrics, if not this set's own: what the
             network was trained on, when it is tested on objects or views from elsewhere.
+        scans: Folder of a set of complete clouds of the same category, in which parts are discovered where this set's
+            clouds are depth views (`model.discovery.grouped`).
         occupancy: Deliver occupancy samples in training and validation; the set must have them
             (`datamodules.occupancy`).
         verify: Compare every shard with its checksum when a stage begins.
@@ -83,6 +85,7 @@ class ArticulatedDataModule(LightningDataModule):
         max_test_samples: int | None = None,
         dense_in_fit: bool = False,
         calibration_set: str | None = None,
+        scans: str | None = None,
         occupancy: bool = False,
         verify: bool = True,
     ) -> None:
@@ -191,17 +194,31 @@ class ArticulatedDataModule(LightningDataModule):
         dataset = ArticulatedDataset(folder, "train", options.num_points, rotate, verify=options.verify)
         return self._loader(dataset, EvaluationSampler(spread_subset(dataset.labels["instance"], samples)))
 
-    def discovery_dataloader(self, samples: int, per_object: tuple[int, int] | None = None) -> DataLoader:
+    def discovery_dataloader(
+        self, samples: int, per_object: tuple[int, int] | None = None, scans: bool = False
+    ) -> DataLoader:
         """Training clouds spread evenly over the split, chosen without looking at any label; as for calibration.
 
         Args:
             samples: How many.
             per_object: Fewest and most clouds of an object, where clouds of the same objects are wanted
                 (`clouds_of_objects`). Which object a cloud shows is known from the recording; it is no label.
+            scans: Of the set `scans` instead, if one is named.
+
+        Raises:
+            ManifestError: if that set is of another category, or not of complete clouds.
         """
-        dataset = ArticulatedDataset(
-            self.folder, "train", self.hparams.num_points, self.manifest.view == "complete", verify=self.hparams.verify
-        )
+        folder, manifest = self.folder, self.manifest
+        if scans and self.hparams.scans is not None:
+            folder = Path(self.hparams.scans)
+            manifest = Manifest.load(folder)
+            if (manifest.category, manifest.view) != (self.hparams.category, "complete"):
+                raise ManifestError(
+                    f"{folder}: holds {manifest.view} clouds of {manifest.category}; data.scans takes complete clouds "
+                    f"of {self.hparams.category}"
+                )
+        rotate, verify = manifest.view == "complete", self.hparams.verify
+        dataset = ArticulatedDataset(folder, "train", self.hparams.num_points, rotate, verify=verify)
         if per_object is None:
             chosen = evenly(np.arange(len(dataset)), samples)
         else:

@@ -70,9 +70,16 @@ class RegisteredShape:
 
     def turned_to_mean(self) -> RegisteredShape:
         """The same with the canonical space turned as the clouds are in the mean."""
-        turn = mean_rotation(self.base[:, :3, :3])
-        turn = se3(turn, turn.new_zeros(3))
-        return replace(self, shape=self.shape.in_frame(turn), base=self.base @ invert_se3(turn))
+        return self.turned(mean_rotation(self.base[:, :3, :3]))
+
+    def turned(
+        self,
+        rotation: Tensor,  # [3, 3]
+    ) -> RegisteredShape:
+        """The same with the canonical space turned."""
+        turn = se3(rotation, rotation.new_zeros(3))
+        axes = None if self.axes is None else rotation @ self.axes
+        return replace(self, shape=self.shape.in_frame(turn), base=self.base @ invert_se3(turn), axes=axes)
 
 
 def trimmed_mean(error: Tensor, count: int) -> float:

@@ -56,7 +56,7 @@ class SearchingRegistrar(Registrar):
         """Search, stretch the candidates, choose, stretch the chosen for longer."""
         few_cycles = self.options.few_cycles
         shape = found.limited()
-        base, state, _ = search_articulated(shape, clouds, self.rotations, _state_starts(found.state))
+        base, state, _ = search_articulated(shape, clouds, self.rotations, state_starts(found.state))
         copies = clouds.repeat_interleave(base.shape[1], dim=0)
         fit = InstanceFit(shape, base.flatten(0, 1), state.flatten(0, 1), self.generator)
         fit.optimise(copies, few_cycles, shared=False)
@@ -113,7 +113,7 @@ def _chosen(candidates: Tensor, best: Tensor) -> Tensor:
     return candidates.unflatten(0, (len(best), -1))[torch.arange(len(best), device=best.device), best]
 
 
-def _state_starts(state: Tensor) -> Tensor:
+def state_starts(state: Tensor) -> Tensor:
     """The middle, and every combination of either side: [1 + 2^J, J]."""
     spread = _STATE_STARTS * state.std(dim=0)
     states = torch.cartesian_prod(*torch.stack([-spread, spread], dim=-1)).view(-1, len(spread))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from articulate_ssl.geometry.screw import REVOLUTE
+from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.shape.joints import Joints, stacked
 from articulate_ssl.shape.part_maps import PartMaps
@@ -115,6 +115,13 @@ class ArticulatedShape:
         axis = self.joints.axis @ frame[:3, :3].T
         pivot = transform_points(frame, self.joints.pivot)
         return replace(self, points=points, joints=replace(self.joints, axis=axis, pivot=pivot))
+
+    def scaled(self, factor: float) -> ArticulatedShape:
+        """The same shape, larger; what slides slides as much farther."""
+        joints = replace(self.joints, pivot=factor * self.joints.pivot)
+        if joints.limits is not None and joints.joint_type == PRISMATIC:
+            joints = replace(joints, limits=factor * joints.limits)
+        return replace(self, points=factor * self.points, joints=joints)
 
     def with_centred_pivots(self) -> ArticulatedShape:
         """Where a pivot sits along its axis is a convention: next to the middle of the part it moves."""

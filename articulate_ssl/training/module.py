@@ -16,8 +16,6 @@ from lightning.pytorch import Callback, LightningModule
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from articulate_ssl.discovery.grouped import MOST_CLOUDS
-from articulate_ssl.discovery.one_object.find import MIN_CLOUDS
 from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.geometry.orientation_range import OrientationRange
 from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE
@@ -43,6 +41,7 @@ from articulate_ssl.training.recipes.recipe import Outcome
 from articulate_ssl.training.running_statistics import RadiusStatistics, StateRange
 from articulate_ssl.training.schedule import ScheduleOptions
 from articulate_ssl.training.self_agreement import LearnConfidence, look_twice
+from articulate_ssl.training.set_clouds import SetClouds
 from articulate_ssl.training.test_report import TestReport
 from datamodules.articulated_dataset import split_labels
 
@@ -238,7 +237,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         found = None
         if self.global_rank == 0:
             try:
-                self.recipe.prepare(self._training_clouds, self.num_points, self._training_objects)
+                self.recipe.prepare(SetClouds(self.trainer.datamodule), self.num_points)
                 # In the host's memory: what is sent from one GPU would arrive on that GPU.
                 found = {name: value.cpu() for name, value in self.state_dict().items()}, self.recipe.kept()
             except Exception as error:
@@ -257,19 +256,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
 
     def _training_clouds(self, count: int) -> Tensor:
         """A fixed subset of the training clouds [n, N, 3] with all their points."""
-        batches = [split_labels(b)[0] for b in self.trainer.datamodule.discovery_dataloader(count)]
-        return torch.cat([b["dense_points"] for b in batches]).float()
-
-    def _training_objects(self, count: int) -> tuple[Tensor, Tensor]:  # [n, N, 3], [n]
-        """Training clouds of whole objects, and which object each shows: known from the recording, not a label."""
-        data = self.trainer.datamodule
-        if data.manifest.view != "complete":
-            raise ValueError(
-                f"discovery.grouped needs complete clouds, and {data.folder} holds depth views; leave it out"
-            )
-        batches = list(data.discovery_dataloader(count, (MIN_CLOUDS, MOST_CLOUDS)))
-        points = torch.cat([split_labels(batch)[0]["dense_points"] for batch in batches])
-        return points.float(), torch.cat([batch["instance"] for batch in batches])
+        return SetClouds(self.trainer.datamodule).clouds(count)
 
     @torch.no_grad()
     def _track(self, outcome: Outcome) -> None:

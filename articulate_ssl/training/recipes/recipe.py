@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -33,6 +33,19 @@ class Outcome(NamedTuple):
     def of(iterations: list[tuple[Terms, Hypotheses]]) -> Outcome:
         """From the terms and selected hypotheses of every iteration."""
         return Outcome(torch.stack([terms.loss for terms, _ in iterations]).mean(), *iterations[-1])
+
+
+class TrainingClouds(Protocol):
+    """The clouds of a training set, as recipes ask for them before the first step; without labels."""
+
+    def clouds(self, count: int) -> Tensor:
+        """So many of them [n, N, 3], with all their points."""
+
+    def scans(self, count: int) -> Tensor:
+        """So many complete clouds [n, N, 3]: the same, or where these are depth views, scans of their category."""
+
+    def objects(self, count: int) -> tuple[Tensor, Tensor]:
+        """About as many scans of whole objects [n, N, 3], and which object each shows [n]."""
 
 
 class Recipe(ABC):
@@ -75,20 +88,14 @@ class Recipe(ABC):
         """Whether the networks have begun to learn, so that it makes sense to validate them."""
         return True
 
-    def prepare(
-        self,
-        clouds: Callable[[int], Tensor],
-        num_points: int,
-        objects: Callable[[int], tuple[Tensor, Tensor]],
-    ) -> None:
+    def prepare(self, data: TrainingClouds, num_points: int) -> None:
         """What comes before the first step after stage 0, unless the recipe is ready. Done by one rank, for all.
 
         Others take over what it found: the module's state, and what `kept` says.
 
         Args:
-            clouds: Gives so many training clouds [n, N, 3], with all their points.
+            data: What there is to learn from.
             num_points: Of a cloud in training.
-            objects: Gives about as many [n, N, 3] of whole objects, and which object each shows [n].
         """
         return
 

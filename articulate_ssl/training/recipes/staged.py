@@ -1,7 +1,9 @@
 """The staged recipe: part discovery by registration, then the network on what that found, then on all clouds.
 
 1. *Discovery* (`discovery.discover`) on some training clouds, before the first step. What it found is handed over
-   whole: shape and joints become the category's, and the clouds that fit best are kept with their registrations.
+   whole: shape and joints become the category's, and the clouds that fit best are kept with their registrations. In the
+   multi-state setting objects are found from all their clouds (`discovery.grouped`), also for depth views, if some
+   objects were scanned from all sides (`discovery.from_scans`).
 2. *Warm-up*: these clouds, turned afresh, with known poses. The category's shapes and joints are held.
 3. *Self-supervision*: any training cloud, by reconstruction.
 """
@@ -16,7 +18,8 @@ import torch
 from torch import Tensor
 
 from articulate_ssl.discovery.discover import discover
-from articulate_ssl.discovery.grouped import discover_grouped, refuse_views
+from articulate_ssl.discovery.from_scans import discover_from_scans
+from articulate_ssl.discovery.grouped import discover_grouped
 from articulate_ssl.discovery.proposals import load_proposals
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
@@ -24,7 +27,8 @@ from articulate_ssl.inference.pose_estimation import Iteration
 from articulate_ssl.losses.objective import PoseTarget, staged_terms
 from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.ops.ranks import own_rows, world
-from articulate_ssl.training.recipes.recipe import Outcome, Recipe
+from articulate_ssl.shape.observation import Observation
+from articulate_ssl.training.recipes.recipe import Outcome, Recipe, TrainingClouds
 
 # Registration that teaches, in every step: shorter than at test time. Chosen, not measured.
 _SCALES, _ROUNDS = (0.04, 0.02), 4
@@ -61,7 +65,7 @@ class TrainingRecipe(Recipe):
         # What makes no sense is to be told before anything runs.
         load_proposals(self.discovery.proposals)
         if self.discovery.grouped:
-            refuse_views(self.estimator.observation)
+            _check_setting(self.estimator.observation)
         self.found: HandOver | None = None
         self.group = rotation_group(len(self.estimator.articulated.pose_head.elements))
 
@@ -80,28 +84,31 @@ class TrainingRecipe(Recipe):
         """After discovery."""
         return self.found is not None
 
-    def prepare(
-        self,
-        clouds: Callable[[int], Tensor],
-        num_points: int,
-        objects: Callable[[int], tuple[Tensor, Tensor]],
-    ) -> None:
+    def prepare(self, data: TrainingClouds, num_points: int) -> None:
         """Part discovery."""
         options, network = self.discovery, self.estimator.articulated
-        dense, category = clouds(options.clouds), (network.num_parts, network.joint_type, options)
+        count, category = options.clouds, (network.num_parts, network.joint_type, options)
         with torch.random.fork_rng(devices=[]), torch.no_grad():
-            if options.grouped:
-                found = discover_grouped(dense, *objects(options.clouds), *category)
+            clouds = data.clouds(count)
+            if self._simulated:
+                scans = data.scans(count), *data.objects(count)
+                orientation = self.estimator.observation.orientation
+                clouds, found = discover_from_scans(clouds, *scans, *category, orientation, num_points)
+                kept = slice(None)
             else:
-                found = discover(dense, *category, self.estimator.observation)
-        kept = found.error.argsort()[: self.discovery.kept(len(dense))]
+                if options.grouped:
+                    found = discover_grouped(clouds, *data.objects(count), *category)
+                else:
+                    found = discover(clouds, *category, self.estimator.observation)
+                kept = found.error.argsort()[: self.discovery.kept(len(clouds))]
+        registered = found.of_clouds(kept)
         self.found = HandOver(
-            dense[kept, :num_points], found.base[kept], found.state[kept], found.log_stretch[kept], found.limits()
+            clouds[kept, :num_points], registered.base, registered.state, registered.log_stretch, found.limits()
         )
         network.category.adopt(found.shape)
-        if found.axes is not None:  # in a frame that the clouds share
+        if found.axes is not None and not self._simulated:  # in a frame that the clouds share
             shape = network.category.articulated_shape(network.joint_type)
-            self.estimator.sliding.learn(shape, found.limits(), dense[kept], found.base[kept])
+            self.estimator.sliding.learn(shape, found.limits(), clouds[kept], registered.base)
 
     def step(self, points: Tensor, step: int, generator: Callable[[], torch.Generator]) -> Outcome:
         """Warm-up or self-supervision."""
@@ -130,8 +137,13 @@ class TrainingRecipe(Recipe):
     def _warm(self) -> int:
         return self.schedule.rigid_steps + self.schedule.warmup_steps
 
+    @property
+    def _simulated(self) -> bool:
+        """Whether views of scans teach, which show what a camera sees: turned, they would show something else."""
+        return self.discovery.grouped and self.estimator.observation.unidirectional
+
     def _warmup_step(self, points: Tensor, generator: torch.Generator) -> Outcome:
-        """Registered clouds turned afresh: poses are known, so the hypothesis nearest to them trains."""
+        """Registered clouds, turned afresh or simulated: poses are known, so the hypothesis nearest to them trains."""
         aligned, target = self._registered_clouds(len(points), generator, points.device)
         category, trained = self.estimator.articulated.category.canonical(), []
         for iteration in self.estimator.iterate(aligned):
@@ -146,7 +158,7 @@ class TrainingRecipe(Recipe):
     def _registered_clouds(
         self, size: int, generator: torch.Generator, device: torch.device
     ) -> tuple[Tensor, PoseTarget]:
-        """A batch of them in random orientations, aligned [B, N, 3], and where the shape is in each."""
+        """A batch of them, in random orientations, aligned [B, N, 3], and where the shape is in each."""
         orientation = self.estimator.observation.orientation
         of_all, _ = world()
         index = own_rows(torch.randint(len(self.found.points), (of_all * size,), generator=generator))
@@ -154,7 +166,9 @@ class TrainingRecipe(Recipe):
         points, base, state = (
             value[index].to(device) for value in (self.found.points, self.found.base, self.found.state)
         )
-        if orientation.limited:
+        if self._simulated:
+            rotation = torch.eye(3).to(rotation).expand_as(rotation)
+        elif orientation.limited:
             rotation = rotation @ base[:, :3, :3].mT  # to an orientation within the range
         turn = se3(rotation, rotation.new_zeros(size, 3))
         aligned, pose = self.estimator.align(transform_points(turn, points))
@@ -180,4 +194,18 @@ class TrainingRecipe(Recipe):
         return PoseTarget(
             torch.where(better[:, None, None], base, selected.base[:, 0].detach()),
             torch.where(better[:, None], state, selected.state[:, 0].detach()),
+        )
+
+
+def _check_setting(observation: Observation) -> None:
+    """Whole objects are found from complete clouds; views of them show some of their sides.
+
+    Raises:
+        ValueError: for views whose hidden sides would count.
+    """
+    if observation.orientation.limited and not observation.unidirectional:
+        raise ValueError(
+            "discovery.grouped finds shapes with all their sides, of which a depth view (orientation_range below 180) "
+            "shows some: add objective.unidirectional true (-c configs/profiles/depth_from_scans.yaml), or leave "
+            "grouped out"
         )

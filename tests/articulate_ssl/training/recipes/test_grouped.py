@@ -16,8 +16,10 @@ from articulate_ssl.losses.objective import ObjectiveOptions
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.joints import Joints
 from articulate_ssl.training.recipes import staged
+from datamodules.manifest import ManifestError
 
 GROUPED = replace(DISCOVERY, clouds=18, grouped=True)
+VIEWS = ObjectiveOptions(unidirectional=True)
 
 
 @pytest.fixture
@@ -93,15 +95,45 @@ def test_a_test_names_the_setting(tmp_path, grouped):
     assert metrics.get("setting") == ("multi-state" if grouped else None)
 
 
-@pytest.mark.parametrize(
-    "options", [{"orientation_range": 100.0}, {"objective": ObjectiveOptions(unidirectional=True)}]
-)
-def test_options_for_depth_views_are_refused_at_once(options):
-    with pytest.raises(ValueError, match="grouped needs complete clouds"):
-        tiny_module(discovery=GROUPED, **options)
+def test_depth_views_whose_hidden_sides_would_count_are_refused_at_once():
+    tiny_module(discovery=GROUPED, orientation_range=100.0, objective=VIEWS)
+    with pytest.raises(ValueError, match=r"add objective\.unidirectional true"):
+        tiny_module(discovery=GROUPED, orientation_range=100.0)
 
 
 def test_depth_views_are_refused_when_training_starts(tmp_path):
     write_synthetic_set(tmp_path, view="partial", protocol="honest")
-    with pytest.raises(ValueError, match=r"grouped needs complete clouds, and .* holds depth views"):
-        fit(tiny_module(discovery=GROUPED), tmp_path, 1, view="partial", protocol="honest")
+    for objective in (ObjectiveOptions(), VIEWS):
+        with pytest.raises(ValueError, match=r"grouped needs complete clouds, and .* holds depth views.*data\.scans"):
+            fit(tiny_module(discovery=GROUPED, objective=objective), tmp_path, 1, view="partial", protocol="honest")
+
+
+def test_views_are_taught_by_scans_of_the_category(tmp_path, monkeypatch):
+    """Depth views, scans and their objects reach discovery; the views that it hands over are not turned."""
+    write_synthetic_set(tmp_path / "views", view="partial", protocol="honest")
+    scans = write_synthetic_set(tmp_path / "scans", states=9)
+    given = {}
+
+    def from_scans(views, clouds, objects, instance, *rest):
+        given["all"] = views, clouds, objects, instance
+        given["rest"] = rest
+        return clouds[:4, :POINTS], _some_shape(clouds[:4])
+
+    monkeypatch.setattr(staged, "discover_from_scans", from_scans)
+    module = tiny_module(discovery=GROUPED, objective=VIEWS, orientation_range=100.0)
+    fit(module, tmp_path / "views", 1, view="partial", protocol="honest", scans=str(scans))
+    views, clouds, objects, instance = given["all"]
+    stored = list(tiny_data(tmp_path / "views", view="partial", protocol="honest").discovery_dataloader(18))
+    assert torch.equal(views, torch.cat([batch["dense_points"] for batch in stored]))
+    assert len(clouds) == 18 and torch.equal(instance, _object_of(tmp_path / "scans", objects))
+    assert given["rest"][-2:] == (module.orientation, POINTS)
+    points, target = module.recipe._registered_clouds(5, torch.Generator().manual_seed(0), torch.device("cpu"))
+    assert all((one == module.recipe.found.points).all(dim=(1, 2)).any() for one in points)
+    assert torch.equal(target.base[:, :3, :3], torch.eye(3).expand(5, 3, 3))
+
+
+def test_scans_of_another_category_or_view_are_refused(tmp_path):
+    views = write_synthetic_set(tmp_path, view="partial", protocol="honest")
+    with pytest.raises(ManifestError, match=r"holds partial clouds of laptop; data\.scans takes complete clouds of"):
+        module = tiny_module(discovery=GROUPED, objective=VIEWS)
+        fit(module, tmp_path, 1, view="partial", protocol="honest", scans=str(views))

@@ -1,0 +1,74 @@
+"""Discovery for depth views from complete scans of some objects of the category, in the multi-state setting.
+
+One view hides half of an object, and no single view is a good template. Where some objects were scanned from all sides,
+in several states each, parts and joints are found there (`grouped`); the views of the category only say how objects are
+turned in front of the camera (`mean_orientation`). What teaches the network are views of the scans, simulated
+(`simulated_views`), whose poses and states are known. No label is used; which scans show the same object is.
+"""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from articulate_ssl.discovery.grouped import discover_grouped
+from articulate_ssl.discovery.mean_orientation import find_mean_orientation
+from articulate_ssl.discovery.options import DiscoveryOptions
+from articulate_ssl.discovery.registered_shape import RegisteredShape
+from articulate_ssl.discovery.registrar import state_starts
+from articulate_ssl.discovery.simulated_views import simulate_views
+from articulate_ssl.geometry.orientation_range import OrientationRange
+from articulate_ssl.geometry.rotation_group import rotation_group
+from articulate_ssl.ops.denormals import flush_denormals
+from articulate_ssl.ops.progress import Stage, announce
+
+_PROBES = 48  # views in which the mean orientation is looked for: within 6 and 13 degrees on lamps and washing machines
+_VIEWS = 12  # that are simulated of every scan
+
+log = logging.getLogger(__name__)
+
+
+@flush_denormals()
+def discover_from_scans(
+    views: Tensor,  # [v, P, 3] depth views of the category
+    clouds: Tensor,  # [n, P, 3] complete, of as many objects as possible, in any orientation
+    scans: Tensor,  # [m, P, 3] the same of whole objects
+    instance: Tensor,  # [m] which object each scan shows
+    num_parts: int,
+    joint_type: int,
+    options: DiscoveryOptions,
+    orientation: OrientationRange,
+    num_points: int,
+) -> tuple[Tensor, RegisteredShape]:
+    """Simulated views [k, num_points, 3], and parts and joints of the category registered to them.
+
+    Args:
+        orientation: How far objects are turned in the views.
+
+    Raises:
+        DiscoveryError: if parts are not found (`discover_grouped`).
+    """
+    found = discover_grouped(clouds, scans, instance, num_parts, joint_type, options)
+    kept = found.error.argsort()[: options.kept(len(clouds))]
+    found, clouds = found.of_clouds(kept), clouds[kept]
+    random, generator = np.random.default_rng(options.seed), torch.Generator().manual_seed(options.seed)
+    mean_distance = float((views - views.mean(dim=1, keepdim=True)).norm(dim=-1).mean())
+    if orientation.limited:
+        _announce(0, "how objects are turned")
+        any_way = OrientationRange().draw(len(clouds), generator)[:, None]
+        _, rough = simulate_views(found, clouds, any_way, num_points, mean_distance, random)
+        rotations = rotation_group(60).elements.to(views)
+        shape, states = rough.limited(), state_starts(rough.state)
+        found = found.turned(find_mean_orientation(shape, states, views[:_PROBES], rotations))
+    _announce(1, "views of the scans")
+    turns = orientation.draw(len(clouds) * _VIEWS, generator).unflatten(0, (-1, _VIEWS))
+    simulated = simulate_views(found, clouds, turns, num_points, mean_distance, random)
+    _announce(2, "done")
+    return simulated
+
+
+def _announce(done: int, name: str) -> None:
+    announce(log, Stage("views from scans", name, done, 2))

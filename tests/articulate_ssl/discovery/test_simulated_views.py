@@ -1,0 +1,78 @@
+"""Views that are simulated show what a camera sees, and say truly where the shape is in them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import roma
+import torch
+from articulated_objects import DRAWER, LAPTOP, clouds, true_shape
+
+from articulate_ssl.discovery.discover import DiscoveryError
+from articulate_ssl.discovery.mean_orientation import find_mean_orientation
+from articulate_ssl.discovery.registered_shape import RegisteredShape
+from articulate_ssl.discovery.registrar import state_starts
+from articulate_ssl.discovery.simulated_views import simulate_views
+from articulate_ssl.geometry.orientation_range import OrientationRange
+from articulate_ssl.geometry.rotation_group import rotation_group
+from articulate_ssl.ops.chamfer import nearest_distance
+
+POINTS = 100
+
+
+def _registered(design, count: int = 6) -> tuple[torch.Tensor, RegisteredShape]:
+    data = clouds(design, count=count, points=1024)
+    stretch = torch.zeros(count, 2, 3)
+    return data.points, RegisteredShape(true_shape(design, data), data.base, data.state, stretch, torch.zeros(count))
+
+
+def _views(design, degrees: float = 60.0, views: int = 3):
+    points, found = _registered(design)
+    turns = OrientationRange(degrees).draw(len(points) * views, torch.Generator().manual_seed(0))
+    turns = turns.unflatten(0, (-1, views))
+    seen, registered = simulate_views(found, points, turns, POINTS, 0.3, np.random.default_rng(0))
+    return turns.flatten(0, 1), seen, registered
+
+
+@pytest.mark.parametrize("design", [LAPTOP, DRAWER], ids=["laptop", "drawer"])
+def test_the_shape_lies_where_the_view_shows_it(design):
+    turns, seen, registered = _views(design)
+    assert seen.shape == (18, POINTS, 3) and len(registered.base) == 18
+    torch.testing.assert_close(registered.base[:, :3, :3], turns)
+    fit = registered.fit(torch.Generator())
+    larger = replace(registered, log_stretch=registered.log_stretch).log_stretch[:, 0, 0].exp()
+    assert larger.log().mean().abs() < 1e-5 and larger.std() > 0.01
+    # In a view's own scale the whole shape, as large as there, passes through every point that is seen.
+    for view, base, state, own in zip(seen, registered.base, registered.state, larger, strict=True):
+        posed = registered.shape.scaled(float(own)).posed(base[None], state[None])
+        assert nearest_distance(view[None], posed).max() < 1e-3
+    assert fit.error(seen).shape == (18,)
+
+
+def test_views_are_normalised_and_the_far_side_is_hidden():
+    _, seen, registered = _views(LAPTOP)
+    assert (seen.norm(dim=-1).mean(dim=1) - 0.3).abs().max() < 0.06  # few points, spread evenly: not as pixels are
+    posed = registered.shape.posed(registered.base, registered.state)
+    far = (posed[..., 2].amax(dim=1) - seen[..., 2].amax(dim=1)).mean()
+    near = (seen[..., 2].amin(dim=1) - posed[..., 2].amin(dim=1)).mean()
+    assert far > near  # the camera looks along z
+
+
+def test_views_of_too_few_points_are_left_out():
+    points, found = _registered(LAPTOP)
+    turns = OrientationRange(60).draw(len(points), torch.Generator().manual_seed(0))[:, None]
+    few, registered = simulate_views(found, points, turns, 400, 0.3, np.random.default_rng(0))
+    assert 0 < len(few) == len(registered.base) < len(points)
+    with pytest.raises(DiscoveryError, match="shows 1000 points"):
+        simulate_views(found, points, turns, 1000, 0.3, np.random.default_rng(0))
+
+
+def test_the_mean_orientation_of_upright_views_is_found():
+    points, found = _registered(LAPTOP, count=16)
+    mean = roma.rotvec_to_rotmat(torch.tensor([0.4, -1.1, 2.0]))
+    turns = (OrientationRange(50).draw(len(points), torch.Generator().manual_seed(1)) @ mean)[:, None]
+    seen, registered = simulate_views(found, points, turns, 200, 0.3, np.random.default_rng(0))
+    states = state_starts(registered.state)
+    rotation = find_mean_orientation(registered.limited(), states, seen, rotation_group(60).elements.float())
+    expected = roma.special_procrustes(registered.base[:, :3, :3].mean(dim=0))
+    assert roma.rotmat_geodesic_distance(rotation, expected).rad2deg() < 10
