@@ -35,8 +35,11 @@ PROFILES = {
     "complete": ("configs/profiles/cpu.yaml",),
     "depth": ("configs/profiles/cpu.yaml", "configs/profiles/depth_camera.yaml"),
 }
-MULTI_STATE_PROFILE = "configs/profiles/multi_state.yaml"
-_PLACES = {("data", "root"), ("trainer", "default_root_dir")}  # options that say where, not what
+MULTI_STATE_PROFILE = {
+    "complete": "configs/profiles/multi_state.yaml",
+    "depth": "configs/profiles/depth_from_scans.yaml",
+}
+_PLACES = {("data", "root"), ("data", "scans"), ("trainer", "default_root_dir")}  # options that say where, not what
 _KEPT_COUNTS = ("samples", "instances", "failures")
 
 # From where on a number of the test is named as a weakness. Chosen, not measured: what a user would notice.
@@ -83,7 +86,7 @@ def pack(
         category=module.category,
         view=view,
         part_names=list(manifest.part_names),
-        data=_about_data(manifest),
+        data=_about_data(manifest) | _about_scans(data.get("scans")),
         training={
             "command": shlex.join(command),
             "seed": int(config["seed_everything"]),
@@ -115,7 +118,7 @@ def newest_metrics(run: Path) -> Path:
 
 def fit_command(category: str, view: str, seed: int, multi_state: bool = False) -> list[str]:
     """What trains the weights of a category and view, as a person types it (but for where things lie)."""
-    files = (f"configs/{category}.yaml", *PROFILES[view], *((MULTI_STATE_PROFILE,) if multi_state else ()))
+    files = (f"configs/{category}.yaml", *PROFILES[view], *((MULTI_STATE_PROFILE[view],) if multi_state else ()))
     return ["lightning", "fit", *(word for file in files for word in ("-c", file)), "--seed_everything", str(seed)]
 
 
@@ -172,6 +175,11 @@ def _about_data(manifest: Manifest) -> dict[str, Any]:
         "train_instances": len(manifest.instances["train"]),
         "test_instances": len(manifest.instances["test"]),
     }
+
+
+def _about_scans(folder: str | None) -> dict[str, Any]:
+    """Of the complete clouds that taught a network for depth views, if some did."""
+    return {} if folder is None else {"scans": _about_data(Manifest.load(folder))["command"]}
 
 
 def _learn_confidence(module: ArticulatedPoseModule, data: dict[str, Any]) -> None:

@@ -1,9 +1,9 @@
 """`make weights`: every set of shipped weights from nothing, by the commands that the cards state.
 
-For each category and view: data, fit, test, pack. The first three are programs of their own, whose words go to log
-files; a stage that has finished leaves a note of its command and is not repeated, and a fit that was cut off goes on
-from its last checkpoint. Data are deleted once their weights are packed: all of them would fill ten gigabytes. It may
-be killed at any moment.
+For each category and view: scans where they teach depth views, data, fit, test, pack. All but the last are programs of
+their own, whose words go to log files; a stage that has finished leaves a note of its command and is not repeated, and
+a fit that was cut off goes on from its last checkpoint. Data are deleted once their weights are packed: all of them
+would fill ten gigabytes. It may be killed at any moment.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from articulate_ssl.pretrained.stages import Stage, StageFailed, Workplace
 from articulate_ssl.training.shipped_weights import WEIGHTS_FOLDER
 from articulate_ssl.training.weights_card import CARD_SUFFIX
 from articulate_ssl.training.weights_file import SUFFIX
+from datamodules.manifest import set_folder
 
 # All but laptop_real, whose objects are laptops.
 CATEGORIES = ("laptop", "oven", "eyeglasses", "washing_machine", "safe", "drawer", "desk_lamp")
@@ -32,8 +33,16 @@ DEPTH_OPTIONS = ("--states", "30", "--views", "4")  # more states and views teac
 # laptops by 800 clouds of 300 objects, for 97 % by 600 clouds of as many objects (docs/experiments.md, step 64).
 COMPLETE_OPTIONS = ("--train-instances", "1000", "--test-instances", "100", "--states", "3", "--rotations", "1")
 # Where parts are not found from single clouds, but from several of one object (docs/experiments.md, step 71).
-MULTI_STATE = (("drawer", "complete"), ("washing_machine", "complete"), ("desk_lamp", "complete"))
+MULTI_STATE = (
+    *(("drawer", "complete"), ("washing_machine", "complete"), ("desk_lamp", "complete")),
+    *(("drawer", "depth"), ("washing_machine", "depth"), ("desk_lamp", "depth")),
+)
 MULTI_STATE_OPTIONS = ("--train-instances", "200", "--test-instances", "60", "--states", "10", "--rotations", "1")
+# Complete clouds of some of the objects, which teach a network for depth views.
+SCANS_OPTIONS = ("--train-instances", "40", "--test-instances", "1", "--states", "10", "--rotations", "1")
+
+
+_DATA, _SCANS = "data", "scans"  # stages whose results are deleted in the end
 
 
 @dataclass(frozen=True)
@@ -69,13 +78,13 @@ class Rebuild:
     @property
     def data_root(self) -> Path:
         """Of its own, so that it can be deleted alone."""
-        return self.place / "data"
+        return self.place / _DATA
 
     @property
     def _data_options(self) -> tuple[str, ...]:
-        if self.multi_state:
-            return MULTI_STATE_OPTIONS
-        return DEPTH_OPTIONS if self.view == "depth" else COMPLETE_OPTIONS
+        if self.view == "depth":
+            return DEPTH_OPTIONS
+        return MULTI_STATE_OPTIONS if self.multi_state else COMPLETE_OPTIONS
 
     @property
     def multi_state(self) -> bool:
@@ -84,16 +93,29 @@ class Rebuild:
 
     def stages(self) -> tuple[Stage, ...]:
         """The programs, in their order."""
-        view = next(data_view for data_view, view in VIEW_OF_DATA.items() if view == self.view)
-        made = ("--category", self.category, "--view", view, "--seed", str(DATA_SEED), "--workers", "1")
         _, fit, *learn = fit_command(self.category, self.view, FIT_SEED, self.multi_state)
+        if self._has_scans:
+            scans = set_folder(str(self.place / _SCANS), self.category, "procedural", "complete", None)
+            learn += ["--data.scans", str(scans)]
         places = ("--data.root", str(self.data_root), "--trainer.default_root_dir", str(self.place / "run"))
-        make, ours = ("-m", "render.generate"), (sys.executable, "-m", "articulate_ssl.cli")
+        ours = (sys.executable, "-m", "articulate_ssl.cli")
+        quiet = ("--trainer.enable_progress_bar", "false")
         return (
-            Stage("data", (sys.executable, *make, *made, *self._data_options, "--out", str(self.data_root))),
-            Stage("fit", (*ours, fit, *learn, *places, "--trainer.enable_progress_bar", "false")),
-            Stage("test", (*ours, "test", *learn, *places, "--trainer.enable_progress_bar", "false")),
+            *((self._making(_SCANS, "complete", SCANS_OPTIONS),) if self._has_scans else ()),
+            self._making(_DATA, self.view, self._data_options),
+            Stage("fit", (*ours, fit, *learn, *places, *quiet)),
+            Stage("test", (*ours, "test", *learn, *places, *quiet)),
         )
+
+    @property
+    def _has_scans(self) -> bool:
+        return self.multi_state and self.view == "depth"
+
+    def _making(self, name: str, view: str, options: tuple[str, ...]) -> Stage:
+        """The program that makes a set."""
+        view = next(data_view for data_view, own in VIEW_OF_DATA.items() if own == view)
+        words = ("--category", self.category, "--view", view, "--seed", str(DATA_SEED), "--workers", "1", *options)
+        return Stage(name, (sys.executable, "-m", "render.generate", *words, "--out", str(self.place / name)))
 
     def run(self, say: Callable[[str], None]) -> None:
         """Do what is not done yet, and say one line about each stage.
@@ -120,15 +142,16 @@ class Rebuild:
         """All or nothing under their name: what is half deleted is never taken for data."""
         rest = self.place / "deleted"
         shutil.rmtree(rest, ignore_errors=True)
-        if self.data_root.is_dir():
-            self.data_root.rename(rest)
-            shutil.rmtree(rest)
+        for made in (self.place / _SCANS, self.data_root):
+            if made.is_dir():
+                made.rename(rest)
+                shutil.rmtree(rest)
 
     def _do(self, stage: Stage, again: bool, say: Callable[[str], None]) -> bool:
         """Run a stage if it is not done, or `again`; whether those behind it must run again."""
         work = self._work
         finished = work.seconds(stage) is not None and not again
-        if finished and (stage.name != "data" or self.data_root.is_dir()):
+        if finished and (stage.name not in (_DATA, _SCANS) or (self.place / stage.name).is_dir()):
             say(f"{self.name}: {stage.name} done before")
             return False
         go_on = resumed(self.place / "run", work.begun(stage) and not again) if stage.name == "fit" else ()

@@ -33,7 +33,8 @@ class WeightsCard:
         category: Category name.
         view: `complete` or `depth`.
         part_names: K names, in the order of the labels; the predicted parts are numbered without them.
-        data: `command` that makes the data, `seed`, numbers of `train_instances` and `test_instances`.
+        data: `command` that makes the data, `seed`, numbers of `train_instances` and `test_instances`; `scans`, the
+            command that makes the complete clouds that taught a network for depth views, if some did.
         training: `command`, `seed`, `steps`, and `commit` of the code that ran it.
         metrics: Of the test split, as in `metrics.json` (`metrics.report`): of each quantity `mean`, `median` and
             `ci95`, the 95 % interval of the mean by a bootstrap over instances, also of single parts or joints; and
@@ -87,6 +88,7 @@ class WeightsCard:
             f"{self.data['test_instances']} test objects):",
             "",
             f"    {self.data['command']}",
+            *([f"    {self.data['scans']}"] if "scans" in self.data else []),
             "",
             f"Training (seed {self.training['seed']}, {self.training['steps']} steps, "
             f"commit {self.training['commit']}):",

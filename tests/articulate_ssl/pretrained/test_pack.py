@@ -98,7 +98,7 @@ def test_a_run_without_a_test_is_refused(run):
 
 
 def test_every_file_that_a_command_names_exists():
-    for options in (("complete", 0), ("depth", 0), ("complete", 0, True)):
+    for options in (("complete", 0), ("depth", 0), ("complete", 0, True), ("depth", 0, True)):
         words = fit_command("washing_machine", *options)
         assert all((ROOT / word).is_file() for word in words if word.endswith(".yaml"))
 

@@ -14,6 +14,7 @@ import pytest
 from articulate_ssl.discovery.one_object.find import MIN_CLOUDS
 from articulate_ssl.pretrained import rebuild as module
 from articulate_ssl.pretrained import stages
+from articulate_ssl.pretrained.pack import MULTI_STATE_PROFILE
 from articulate_ssl.pretrained.rebuild import (
     CATEGORIES,
     MULTI_STATE,
@@ -23,6 +24,7 @@ from articulate_ssl.pretrained.rebuild import (
     commit_of,
     rebuild,
 )
+from datamodules.manifest import set_folder
 from render.generate import _parser
 
 
@@ -147,20 +149,28 @@ def test_a_failure_names_the_log_and_does_not_stop_the_others(plan, programs):
 @pytest.mark.parametrize("view", ["complete", "depth"])
 @pytest.mark.parametrize("category", CATEGORIES)
 def test_every_command_is_one_that_its_program_takes(tmp_path, category, view):
-    data, fit, test = Rebuild(category, view, tmp_path).stages()
+    *_, data, fit, test = Rebuild(category, view, tmp_path).stages()
     options = _parser().parse_args(data.command[3:])
     assert options.category == category and options.view == {"complete": "complete", "depth": "partial"}[view]
     assert [stage.command[3] for stage in (fit, test)] == ["fit", "test"]
     assert fit.command[4:] == test.command[4:]
 
 
-def test_objects_in_the_multi_state_setting_have_clouds_enough(tmp_path):
-    """And nothing but the setting makes a difference between categories."""
-    for category, view in MULTI_STATE:
-        data, fit, _ = Rebuild(category, view, tmp_path).stages()
-        assert _parser().parse_args(data.command[3:]).states >= MIN_CLOUDS
-        assert "configs/profiles/multi_state.yaml" in fit.command
-    assert "configs/profiles/multi_state.yaml" not in Rebuild("laptop", "complete", tmp_path).stages()[1].command
+@pytest.mark.parametrize(("category", "view"), MULTI_STATE)
+def test_objects_in_the_multi_state_setting_have_clouds_enough(tmp_path, category, view):
+    """Where views are taught by scans, the scans; and the fit finds them."""
+    first, *_, fit, test = Rebuild(category, view, tmp_path).stages()
+    options = _parser().parse_args(first.command[3:])
+    assert options.states >= MIN_CLOUDS and options.view == "complete"
+    assert any(profile in fit.command for profile in MULTI_STATE_PROFILE.values())
+    scans = set_folder(str(options.out), category, "procedural", "complete", None)
+    for command in (fit.command, test.command):
+        assert ("--data.scans" in command) == (view == "depth") == (str(scans) in command)
+
+
+def test_other_weights_are_of_single_clouds(tmp_path):
+    fit = Rebuild("laptop", "complete", tmp_path).stages()[1]
+    assert not any(profile in fit.command for profile in MULTI_STATE_PROFILE.values())
 
 
 def test_the_commit_is_that_of_the_folder(tmp_path):
