@@ -21,6 +21,7 @@ from articulate_ssl.discovery.discover import discover
 from articulate_ssl.discovery.from_scans import discover_from_scans
 from articulate_ssl.discovery.grouped import discover_grouped
 from articulate_ssl.discovery.proposals import load_proposals
+from articulate_ssl.discovery.registered_shape import RegisteredShape
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
 from articulate_ssl.inference.pose_estimation import Iteration
@@ -86,21 +87,11 @@ class TrainingRecipe(Recipe):
 
     def prepare(self, data: TrainingClouds, num_points: int) -> None:
         """Part discovery."""
-        options, network = self.discovery, self.estimator.articulated
-        count, category = options.clouds, (network.num_parts, network.joint_type, options)
+        network = self.estimator.articulated
         with torch.random.fork_rng(devices=[]), torch.no_grad():
-            clouds = data.clouds(count)
-            if self._simulated:
-                scans = data.scans(count), *data.objects(count)
-                orientation = self.estimator.observation.orientation
-                clouds, found = discover_from_scans(clouds, *scans, *category, orientation, num_points)
-                kept = slice(None)
-            else:
-                if options.grouped:
-                    found = discover_grouped(clouds, *data.objects(count), *category)
-                else:
-                    found = discover(clouds, *category, self.estimator.observation)
-                kept = found.error.argsort()[: self.discovery.kept(len(clouds))]
+            clouds, found = self._discovered(data, num_points)
+        # All simulated views are of clouds that fit well.
+        kept = slice(None) if self._simulated else found.error.argsort()[: self.discovery.kept(len(clouds))]
         registered = found.of_clouds(kept)
         self.found = HandOver(
             clouds[kept, :num_points], registered.base, registered.state, registered.log_stretch, found.limits()
@@ -109,6 +100,17 @@ class TrainingRecipe(Recipe):
         if found.axes is not None and not self._simulated:  # in a frame that the clouds share
             shape = network.category.articulated_shape(network.joint_type)
             self.estimator.sliding.learn(shape, found.limits(), clouds[kept], registered.base)
+
+    def _discovered(self, data: TrainingClouds, num_points: int) -> tuple[Tensor, RegisteredShape]:
+        """Training clouds [n, N, 3], or views that were simulated, and the category's shape registered to them."""
+        options, network, observation = self.discovery, self.estimator.articulated, self.estimator.observation
+        clouds, category = data.clouds(options.clouds), (network.num_parts, network.joint_type, options)
+        if self._simulated:
+            scans = data.scans(options.clouds), *data.objects(options.clouds)
+            return discover_from_scans(clouds, *scans, *category, observation.orientation, num_points)
+        if options.grouped:
+            return clouds, discover_grouped(clouds, *data.objects(options.clouds), *category)
+        return clouds, discover(clouds, *category, observation)
 
     def step(self, points: Tensor, step: int, generator: Callable[[], torch.Generator]) -> Outcome:
         """Warm-up or self-supervision."""
