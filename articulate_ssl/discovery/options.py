@@ -29,8 +29,8 @@ class DiscoveryOptions:
         min_share: Splits with a part smaller than this share of the template are discarded.
         seed: Of the random splits.
         grouped: The multi-state setting: which clouds show the same object is known, and templates are whole objects
-            (`discovery.grouped`; for depth views `discovery.from_scans`). An easier problem than the paper's, which sees
-            single clouds.
+            (`discovery.grouped`; for depth views `discovery.from_scans`). An easier problem than the paper's, which
+            sees single clouds.
     """
 
     clouds: int = 192

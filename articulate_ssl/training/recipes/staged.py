@@ -90,6 +90,8 @@ class TrainingRecipe(Recipe):
         network = self.estimator.articulated
         with torch.random.fork_rng(devices=[]), torch.no_grad():
             clouds, found = self._discovered(data, num_points)
+        if network.shared_axis and network.num_parts > 2:
+            found = found.with_parallel_axes()
         # All simulated views are of clouds that fit well.
         kept = slice(None) if self._simulated else found.error.argsort()[: self.discovery.kept(len(clouds))]
         registered = found.of_clouds(kept)
