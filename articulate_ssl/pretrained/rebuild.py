@@ -33,10 +33,7 @@ DEPTH_OPTIONS = ("--states", "30", "--views", "4")  # more states and views teac
 # laptops by 800 clouds of 300 objects, for 97 % by 600 clouds of as many objects (docs/experiments.md, step 64).
 COMPLETE_OPTIONS = ("--train-instances", "1000", "--test-instances", "100", "--states", "3", "--rotations", "1")
 # Where clouds that are known to show one object find parts better than single ones (docs/experiments.md, steps 71, 72).
-MULTI_STATE = (
-    *(("drawer", "complete"), ("desk_lamp", "complete")),
-    *(("safe", "depth"), ("washing_machine", "depth"), ("desk_lamp", "depth")),
-)
+MULTI_STATE = (("drawer", "complete"), ("desk_lamp", "complete"), ("safe", "depth"), ("washing_machine", "depth"))
 MULTI_STATE_OPTIONS = ("--train-instances", "200", "--test-instances", "60", "--states", "10", "--rotations", "1")
 # Complete clouds of some of the objects, which teach a network for depth views.
 SCANS_OPTIONS = ("--train-instances", "40", "--test-instances", "1", "--states", "10", "--rotations", "1")
