@@ -37,8 +37,6 @@ MULTI_STATE = (("drawer", "complete"), ("desk_lamp", "complete"), ("safe", "dept
 MULTI_STATE_OPTIONS = ("--train-instances", "200", "--test-instances", "60", "--states", "10", "--rotations", "1")
 # Complete clouds of some of the objects, which teach a network for depth views.
 SCANS_OPTIONS = ("--train-instances", "40", "--test-instances", "1", "--states", "10", "--rotations", "1")
-
-
 _DATA, _SCANS = "data", "scans"  # stages whose results are deleted in the end
 
 
