@@ -119,7 +119,15 @@ def newest_metrics(run: Path) -> Path:
 def fit_command(category: str, view: str, seed: int, multi_state: bool = False) -> list[str]:
     """What trains the weights of a category and view, as a person types it (but for where things lie)."""
     files = (f"configs/{category}.yaml", *PROFILES[view], *((MULTI_STATE_PROFILE[view],) if multi_state else ()))
-    return ["lightning", "fit", *(word for file in files for word in ("-c", file)), "--seed_everything", str(seed)]
+    scans = ("--data.scans", f"data/{category}/procedural-complete") if multi_state and view == "depth" else ()
+    return [
+        "lightning",
+        "fit",
+        *(word for file in files for word in ("-c", file)),
+        *scans,
+        "--seed_everything",
+        str(seed),
+    ]
 
 
 def generate_arguments(manifest: Manifest) -> list[str]:

@@ -91,7 +91,7 @@ class Rebuild:
         _, fit, *learn = fit_command(self.category, self.view, FIT_SEED, self.multi_state)
         if self._has_scans:
             scans = set_folder(str(self.place / _SCANS), self.category, "procedural", "complete", None)
-            learn += ["--data.scans", str(scans)]
+            learn[learn.index("--data.scans") + 1] = str(scans)
         places = ("--data.root", str(self.data_root), "--trainer.default_root_dir", str(self.place / "run"))
         ours = (sys.executable, "-m", "articulate_ssl.cli")
         quiet = ("--trainer.enable_progress_bar", "false")
