@@ -6,8 +6,8 @@
 3. *Registration* at test time: the leading hypotheses' predicted shapes are registered to the cloud without leaving
    their joints, and the best reconstruction wins.
    Where parts slide, the category's own shape is looked for, too, in the frame of the cloud (`sliding_search`).
-4. *Decision*, where a category's clouds can be explained in two ways that fit alike: the winner's twin is registered,
-   too, and the relief of all points decides (`two_ways`).
+4. *Decision*, where a category's clouds can be explained in two ways that fit alike: the relief of all points decides
+   between the winner and its twin (`two_ways`), which is registered, too, if the winner was.
 
 Training takes the first two steps too; nothing here knows a loss or an optimiser.
 """
@@ -274,8 +274,8 @@ class PoseEstimator:
             num_points: The networks read this many leading points; registration reads all.
             refine: Register at test time, or not; None does what the options say.
             dense: What a decision between two explanations and a search for sliding parts read, an even sample of the
-                surface and about as many points as in training; without them, and without registration, there is
-                neither.
+                surface and about as many points as in training; without them there is neither, and without
+                registration no search.
 
         Raises:
             ValueError: if a cloud has NaN or infinite points.
@@ -304,12 +304,22 @@ class PoseEstimator:
                 chosen, other, margin = self._slid(points, dense, candidates)
             else:
                 chosen, other, margin = self._best(candidates)
-            if registers and dense is not None and self.two_ways.learnt:
-                twin = self._twin(chosen, points)
-                odds = self.two_ways.log_odds(self._relief(chosen, dense), self._relief(twin, dense))
-                chosen, other = either(odds < 0, twin, chosen), either(odds < 0, chosen, twin)
-                margin = (odds.abs() / 2).tanh()  # how much likelier than not
+            if dense is not None and self.two_ways.learnt:
+                chosen, other, margin = self._decided(chosen, points, dense, registers)
             return self._prediction(chosen, points, margin), self._prediction(other, points, torch.zeros_like(margin))
+
+    def _decided(
+        self,
+        one: Hypotheses,  # H = 1
+        points: Tensor,  # [B, N, 3]
+        dense: Tensor,  # [B, P, 3]
+        registers: bool,
+    ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
+        """Of the two explanations of clouds the one that their relief favours, the other, and by how much."""
+        twin = self._twin(one, points, registers)
+        odds = self.two_ways.log_odds(self._relief(one, dense), self._relief(twin, dense))
+        chosen, other = either(odds < 0, twin, one), either(odds < 0, one, twin)
+        return chosen, other, (odds.abs() / 2).tanh()  # how much likelier than not
 
     def _best(self, candidates: Candidates) -> tuple[Hypotheses, Hypotheses, Tensor]:
         """The best candidate of every cloud, its rival, and the margin between them [B]."""
@@ -328,7 +338,7 @@ class PoseEstimator:
     ) -> tuple[Tensor, Tensor]:  # [B, F], [B, F]
         """The relief of predictions and of their twins, from which `two_ways` learns to decide."""
         chosen, _, _ = self._best(self._candidates(points, num_points, registers=True))
-        return self._relief(chosen, dense), self._relief(self._twin(chosen, points), dense)
+        return self._relief(chosen, dense), self._relief(self._twin(chosen, points, registers=True), dense)
 
     def _candidates(self, points: Tensor, num_points: int, registers: bool) -> Candidates:
         """The network's hypotheses, or the leading ones registered, in the frame of the points."""
@@ -377,11 +387,14 @@ class PoseEstimator:
         self,
         one: Hypotheses,  # H = 1
         points: Tensor,  # [B, N, 3]
+        registers: bool,
     ) -> Hypotheses:
-        """The other explanation of clouds that have two, registered."""
+        """The other explanation of clouds that have two, registered or as it follows from the one."""
         pose = self.two_ways.twin_poses(one.object_pose()[:, 0])
         state = one.articulated_shape().read_states(pose)
         start = one.at(pose[:, None, one.chain.root], state[:, None])
+        if not registers:
+            return start
         scales = self.inference.coarse_scale, self.inference.fine_scale
         base, state, _ = self.register(start, points, scales, self.inference.rounds)
         return one.at(base, state)
@@ -412,7 +425,7 @@ class PoseEstimator:
         state_range: Tensor,  # [J, 2] lowest and highest joint state in training
         dense: Tensor | None = None,  # [B, P, 3] the same clouds with all their points
     ) -> Prediction:
-        """Predictions of the category's shape and joints alone: no network has a say.
+        """Predictions of the category's shape and joints alone: no network has a say, a learnt decision has.
 
         They are searched (`search_articulated`) from the 60 rotations of the icosahedron, those within the orientation
         range, and from joints in the middle of their range and, in every combination, at either side of it; 3 states
@@ -431,6 +444,8 @@ class PoseEstimator:
             base, state, error = search_articulated(shape, points, rotations, torch.cat([middle[None], sides]))
             candidates = Candidates(error, base, self.articulated.category_at(base, state).select)
             found, _, margin = self._best(candidates)
+            if dense is not None and self.two_ways.learnt:
+                found, _, margin = self._decided(found, points, dense, registers=True)
             return self._prediction(found, points, margin)
 
     def _refine(self, last: Iteration, points: Tensor) -> tuple[Hypotheses, Tensor]:

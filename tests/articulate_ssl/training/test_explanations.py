@@ -6,7 +6,7 @@ from tiny import POINTS, tiny_module
 
 from articulate_ssl.inference.relief import NUM_FEATURES
 from articulate_ssl.training import explanations
-from articulate_ssl.training.explanations import learn_two_ways
+from articulate_ssl.training.explanations import _object_poses, learn_two_ways
 
 
 @pytest.fixture
@@ -42,26 +42,50 @@ def test_an_object_with_one_explanation_gets_no_twin(module, clouds, monkeypatch
     assert not module.two_ways.learnt
 
 
-def test_without_registration_or_dense_points_nothing_is_decided(module, clouds):
-    before = module.predict_points(clouds[:, :POINTS])
+@pytest.mark.parametrize("refine", [True, False])
+def test_without_dense_points_nothing_is_decided(module, clouds, refine):
+    before = module.predict_points(clouds[:, :POINTS], refine)
     taught(module, 100.0)
-    after = module.predict_points(clouds[:, :POINTS])
+    after = module.predict_points(clouds[:, :POINTS], refine)
     torch.testing.assert_close(after.base_pose, before.base_pose, atol=0, rtol=0)
-    alone = module.predict_points(clouds[:, :POINTS], refine=False, dense=clouds)
-    torch.testing.assert_close(alone.margin, module.predict_points(clouds[:, :POINTS], refine=False).margin)
+    torch.testing.assert_close(after.margin, before.margin, atol=0, rtol=0)
 
 
-def test_the_decision_chooses_one_of_the_same_two_explanations(module, clouds):
+@pytest.mark.parametrize("refine", [True, False])
+def test_the_decision_chooses_one_of_the_same_two_explanations(module, clouds, refine):
     """Opposite preferences give opposite answers, the better explanation of one is the rival of the other."""
     taught(module, 50.0)
-    longer = module.estimator.predict_with_rivals(clouds[:, :POINTS], POINTS, dense=clouds)
+    longer = module.estimator.predict_with_rivals(clouds[:, :POINTS], POINTS, refine, clouds)
     taught(module, -50.0)
-    shorter = module.estimator.predict_with_rivals(clouds[:, :POINTS], POINTS, dense=clouds)
+    shorter = module.estimator.predict_with_rivals(clouds[:, :POINTS], POINTS, refine, clouds)
     decided = longer[0].margin > 0
     assert decided.any()
     torch.testing.assert_close(longer[0].base_pose[decided], shorter[1].base_pose[decided])
     torch.testing.assert_close(longer[1].base_pose[decided], shorter[0].base_pose[decided])
     torch.testing.assert_close(longer[0].margin, shorter[0].margin)
+
+
+def test_unregistered_predictions_have_a_twin_that_follows_from_them(module, clouds):
+    """Nothing moves the other explanation but the relation that was learnt."""
+    taught(module, 50.0)
+    found, other = module.estimator.predict_with_rivals(clouds[:, :POINTS], POINTS, False, clouds)
+    for one, two in ((found, other), (other, found)):
+        pose = module.two_ways.twin_poses(_object_poses(one))
+        root = module.articulated.category.chain().root
+        same = (_object_poses(two)[:, root] - pose[:, root]).abs().amax(dim=(1, 2)) < 1e-4
+        related = same if one is found else related | same
+    assert related.all()
+
+
+def test_a_search_without_a_network_is_decided_alike(module, clouds):
+    state_range = torch.tensor([[-1.0, 1.0]])
+    taught(module, 50.0)
+    longer = module.estimator.search(clouds[:, :POINTS], state_range, clouds)
+    taught(module, -50.0)
+    shorter = module.estimator.search(clouds[:, :POINTS], state_range, clouds)
+    torch.testing.assert_close(longer.margin, shorter.margin)
+    turned = (longer.base_pose - shorter.base_pose).abs().amax(dim=(1, 2)) > 1e-3
+    assert turned[longer.margin > 0].all() and (longer.margin > 0).any()
 
 
 def test_the_decision_is_part_of_the_weights(module):
