@@ -26,7 +26,7 @@ from articulate_ssl.ops.denormals import flush_denormals
 from articulate_ssl.ops.progress import Stage, announce
 
 _PROBES = 48  # views in which the mean orientation is looked for: within 6 and 13 degrees on lamps and washing machines
-_VIEWS = 12  # that are simulated of every scan
+_VIEWS = 30  # that are simulated of every scan, each of an object with other proportions and joint states
 
 log = logging.getLogger(__name__)
 
@@ -65,7 +65,7 @@ def discover_from_scans(
         found = found.turned(find_mean_orientation(shape, states, views[:_PROBES], rotations))
     _announce(1, "views of the scans")
     turns = orientation.draw(len(clouds) * _VIEWS, generator).unflatten(0, (-1, _VIEWS))
-    simulated = simulate_views(found, clouds, turns, num_points, mean_distance, random)
+    simulated = simulate_views(found, clouds, turns, num_points, mean_distance, random, reshape=True)
     _announce(2, "done")
     return simulated
 

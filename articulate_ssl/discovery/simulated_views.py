@@ -18,6 +18,7 @@ from torch import Tensor
 from articulate_ssl.discovery.discover import DiscoveryError
 from articulate_ssl.discovery.one_object.surface import Surface
 from articulate_ssl.discovery.registered_shape import RegisteredShape
+from articulate_ssl.discovery.reshaping import Reshaping
 from articulate_ssl.geometry.screw import PRISMATIC
 from articulate_ssl.ops.hidden_points import seen_from_origin
 
@@ -32,6 +33,7 @@ def simulate_views(
     num_points: int,
     mean_distance: float,
     generator: np.random.Generator,
+    reshape: bool = False,
 ) -> tuple[Tensor, RegisteredShape]:
     """V views [n, N, 3] of every cloud, in the camera's frame, and the shape registered to them.
 
@@ -41,25 +43,30 @@ def simulate_views(
     Args:
         num_points: N.
         mean_distance: Of a view's points to their centre, as its pixels count them; views are normalised to it.
-        generator: Of the camera's distance.
+        generator: Of the camera's distance, and of proportions.
+        reshape: Whether each view is of another object, with other proportions and joint states (`reshaping`).
 
     Raises:
         DiscoveryError: if no view shows so many points.
     """
-    points, bases, scales, sources = [], [], [], []
-    for i, (cloud, base) in enumerate(zip(clouds.double().numpy(), found.base.double().numpy(), strict=True)):
-        surface = Surface.of(cloud)
-        for rotation in rotations[i].double().numpy():
+    points, bases, scales, states, sources = [], [], [], [], []
+    reshaping, drawn = Reshaping(found, clouds), torch.Generator().manual_seed(int(generator.integers(2**31)))
+    base = found.base.double().numpy()
+    for rotation in rotations.double().numpy().swapaxes(0, 1):
+        objects = reshaping.draw(drawn) if reshape else reshaping.unchanged()
+        oriented = zip(objects.points.double().numpy(), objects.normals.double().numpy(), strict=True)
+        for i, surface in enumerate(oriented):
             turn = np.eye(4)
-            turn[:3, :3] = rotation @ base[:3, :3].T
-            view = _view(surface.moved(turn), mean_distance, generator)
+            turn[:3, :3] = rotation[i] @ base[i, :3, :3].T
+            view = _view(Surface(*surface).moved(turn), mean_distance, generator)
             if len(view.points) < num_points:
                 continue
-            pose = turn @ base
+            pose = turn @ base[i]
             pose[:3, 3] = view.scale * (pose[:3, 3] + view.shift)
             points.append(view.points[:num_points])
             bases.append(pose)
             scales.append(view.scale)
+            states.append(objects.state[i])
             sources.append(i)
     if not points:
         raise DiscoveryError(
@@ -68,7 +75,7 @@ def simulate_views(
         )
     scale = torch.tensor(scales, dtype=clouds.dtype)
     mean = math.exp(float(scale.log().mean()))
-    state, stretch = found.state[sources], found.log_stretch[sources] + (scale / mean).log()[:, None, None]
+    state, stretch = torch.stack(states), found.log_stretch[sources] + (scale / mean).log()[:, None, None]
     if found.shape.joints.joint_type == PRISMATIC:
         state = state * scale[:, None]
     registered = replace(

@@ -8,6 +8,8 @@
    Where parts slide, the category's own shape is looked for, too, in the frame of the cloud (`sliding_search`).
 4. *Decision*, where a category's clouds can be explained in two ways that fit alike: the relief of all points decides
    between the winner and its twin (`two_ways`), which is registered, too, if the winner was.
+5. *Hand*, where upright cameras see objects and their mirror images: clouds are explained in a mirror, too, and how
+   well either explains them decides (`handedness`).
 
 Training takes the first two steps too; nothing here knows a loss or an optimiser.
 """
@@ -29,6 +31,7 @@ from articulate_ssl.discovery.search import search_articulated
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
+from articulate_ssl.inference.handedness import Handedness, in_the_mirror
 from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.inference.relief import NUM_FEATURES, describe_relief
 from articulate_ssl.inference.sliding_search import SlidingSearch
@@ -194,6 +197,7 @@ class PoseEstimator:
         agreement, compared: See `Iteration`; recipes may set them.
         two_ways: The decision between explanations that fit alike, if one was learnt; a module owns it.
         sliding: The search for parts that slide, if one was learnt; a module owns it.
+        handedness: Whether clouds show the category's mirror image, if some do; a module owns it.
     """
 
     agreement: float = 0.0
@@ -212,6 +216,7 @@ class PoseEstimator:
         self.observation, self.posterior_scale, self.inference = observation, posterior_scale, inference
         self.two_ways = TwoWays(articulated.num_parts, articulated.num_parts * NUM_FEATURES)
         self.sliding = SlidingSearch(*articulated.category.template.shape[:2])
+        self.handedness = Handedness()
 
     def align(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Stage 0: clouds turned roughly to canonical orientation [B, N, 3], and the pose [B, 4, 4] that undoes it."""
@@ -297,6 +302,26 @@ class PoseEstimator:
         """
         if not torch.isfinite(points).all():
             raise ValueError("a cloud has NaN or infinite points")
+        seen = self._explained(points, num_points, refine, dense)
+        if not self.handedness.learnt:
+            return seen
+        dense = None if dense is None else in_the_mirror(dense)
+        return self.handedness.likelier(seen, self._explained(in_the_mirror(points), num_points, refine, dense))
+
+    @torch.no_grad()
+    def mirror_errors(
+        self,
+        points: Tensor,  # [B, N, 3] normalised, farthest-point order
+        num_points: int,
+    ) -> tuple[Tensor, Tensor]:  # [B], [B]
+        """Errors of predictions, and of those of the clouds' mirror images, from which `handedness` learns."""
+        seen = (self._explained(some, num_points, None, None)[0] for some in (points, in_the_mirror(points)))
+        return tuple(prediction.reconstruction_error for prediction in seen)
+
+    def _explained(
+        self, points: Tensor, num_points: int, refine: bool | None, dense: Tensor | None
+    ) -> tuple[Prediction, Prediction]:
+        """See `predict_with_rivals`: by the category's own hand."""
         with torch.autocast(points.device.type, enabled=False):
             registers = (self.inference.refine if refine is None else refine) is not False
             candidates = self._candidates(points, num_points, registers)
@@ -431,6 +456,15 @@ class PoseEstimator:
         range, and from joints in the middle of their range and, in every combination, at either side of it; 3 states
         for one joint. Where parts slide, `sliding_search` takes the place of that, if there are dense clouds.
         """
+        seen = self._searched(points, state_range, dense)
+        if not self.handedness.learnt:
+            return seen
+        dense = None if dense is None else in_the_mirror(dense)
+        mirrored = self._searched(in_the_mirror(points), state_range, dense)
+        return self.handedness.likelier((seen, seen), (mirrored, mirrored))[0]
+
+    def _searched(self, points: Tensor, state_range: Tensor, dense: Tensor | None) -> Prediction:
+        """See `search`: by the category's own hand."""
         with torch.autocast(points.device.type, enabled=False):
             if dense is not None and self.sliding.learnt:
                 found, _, margin = self._slid(points, dense)

@@ -6,7 +6,7 @@
     network              the network, nothing registered after it
     network_registered   the network, its predicted shapes registered to the cloud
 
-Where clouds can be explained in two ways, the decision that was learnt (`inference/two_ways.py`) takes part in all three.
+Where clouds can be explained in two ways, the decision that was learnt (`inference.two_ways`) takes part in all three.
 Each is calibrated on its own predictions of the same training clouds, and scored on the same test clouds.
 """
 

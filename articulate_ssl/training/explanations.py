@@ -1,4 +1,7 @@
-"""What `inference.two_ways` is learnt from: training clouds that can be explained in two ways, without labels."""
+"""What `inference.two_ways` and `handedness` are learnt from: training clouds that can be explained in two ways.
+
+No label is read.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from torch import Tensor
 from articulate_ssl.inference.prediction import Prediction, concatenate
 from articulate_ssl.inference.two_ways import FEWEST
 from articulate_ssl.ops.progress import announced
+from articulate_ssl.shape.object_axes import object_axes
 
 if TYPE_CHECKING:
     from articulate_ssl.training.module import ArticulatedPoseModule
@@ -41,6 +45,19 @@ def learn_two_ways(
     reliefs = [estimator.reliefs(some[:, :count], module.num_points, some) for some in shown]
     if not estimator.two_ways.learn_decision(*(torch.cat(several) for several in zip(*reliefs, strict=True))):
         log.warning("too few clouds show all parts in both explanations: none is decided")
+
+
+@torch.no_grad()
+def learn_handedness(
+    module: ArticulatedPoseModule,
+    clouds: Tensor,  # [n, N, 3] farthest-point order, of an upright camera
+) -> None:
+    """Find out whether some objects are mirror images of the others."""
+    estimator, network, count = module.estimator, module.articulated, max(module.num_points, module.inference.points)
+    shown = announced(log, "mirror images", clouds.split(_BATCH))
+    errors = [estimator.mirror_errors(some[:, :count], module.num_points) for some in shown]
+    axes = object_axes(network.category.articulated_shape(network.joint_type))
+    estimator.handedness.learn(*(torch.cat(several) for several in zip(*errors, strict=True)), axes)
 
 
 def _object_poses(prediction: Prediction) -> Tensor:

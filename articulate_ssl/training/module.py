@@ -33,7 +33,7 @@ from articulate_ssl.ops.progress import announced
 from articulate_ssl.ops.ranks import of_all_ranks
 from articulate_ssl.shape.observation import Observation
 from articulate_ssl.training.columns import TestColumns
-from articulate_ssl.training.explanations import learn_two_ways
+from articulate_ssl.training.explanations import learn_handedness, learn_two_ways
 from articulate_ssl.training.hub import HubWeights
 from articulate_ssl.training.label_free_report import LabelFreeReport
 from articulate_ssl.training.recipes import recipe_class
@@ -78,6 +78,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             from which confidence is learnt without them.
         two_ways_samples: Training clouds from which the decision between two explanations that fit alike is learnt
             (`inference.two_ways`), if the category has such; 0 learns none.
+        handedness_samples: Training clouds of an upright camera from which it is learnt whether some objects are mirror
+            images of the others (`inference.handedness`); 0 learns nothing of it.
         orientation_range: How far objects are turned from their mean orientation at most, in degrees; 180 stands for
             any orientation, less where a camera is held upright.
 
@@ -100,6 +102,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         inference: InferenceOptions = InferenceOptions(),  # noqa: B008
         calibration_samples: int = 128,
         two_ways_samples: int = 1000,
+        handedness_samples: int = 256,
         orientation_range: float = 180.0,
     ) -> None:
         super().__init__()
@@ -116,7 +119,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             inference = replace(inference, part_neighbours=recipe_type.part_neighbours)
         self.category, self.num_parts, self.schedule = category, num_parts, schedule
         self.inference, self.calibration_samples = inference, calibration_samples
-        self.two_ways_samples = two_ways_samples
+        self.two_ways_samples, self.handedness_samples = two_ways_samples, handedness_samples
 
         self.articulated = ArticulatedNetwork(network, num_parts, JOINT_TYPES[joint_type], state_bound=state_range)
         self.rigid = RigidAlignment(network, num_parts * network.shape_points) if schedule.rigid_steps else None
@@ -126,6 +129,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             self.articulated, self.rigid, iterations, observation, objective.posterior_scale, inference
         )
         self.two_ways, self.sliding = self.estimator.two_ways, self.estimator.sliding
+        self.handedness = self.estimator.handedness
         self.recipe = recipe_type(self.estimator, objective, schedule, discovery)
         self.radius = RadiusStatistics()
         self.states = StateRange(num_parts - 1)
@@ -184,6 +188,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         decides = self.two_ways_samples and not self.orientation.limited and not self.sliding.learnt
         if decides and self.inference.refine:
             learn_two_ways(self, self._training_clouds(self.two_ways_samples).to(self.device))
+        if self.handedness_samples and self.orientation.limited:
+            learn_handedness(self, self._training_clouds(self.handedness_samples).to(self.device))
         clouds = self._training_clouds(self.calibration_samples).to(self.device)
         self.confidence.learn(*look_twice(self, clouds))
         self.train(training)

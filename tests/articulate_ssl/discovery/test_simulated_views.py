@@ -31,7 +31,7 @@ def _views(design, degrees: float = 60.0, views: int = 3):
     turns = OrientationRange(degrees).draw(len(points) * views, torch.Generator().manual_seed(0))
     turns = turns.unflatten(0, (-1, views))
     seen, registered = simulate_views(found, points, turns, POINTS, 0.3, np.random.default_rng(0))
-    return turns.flatten(0, 1), seen, registered
+    return turns.transpose(0, 1).flatten(0, 1), seen, registered
 
 
 @pytest.mark.parametrize("design", [LAPTOP, DRAWER], ids=["laptop", "drawer"])

@@ -69,12 +69,11 @@ def test_unregistered_predictions_have_a_twin_that_follows_from_them(module, clo
     """Nothing moves the other explanation but the relation that was learnt."""
     taught(module, 50.0)
     found, other = module.estimator.predict_with_rivals(clouds[:, :POINTS], POINTS, False, clouds)
+    root, related = module.articulated.category.chain().root, []
     for one, two in ((found, other), (other, found)):
-        pose = module.two_ways.twin_poses(_object_poses(one))
-        root = module.articulated.category.chain().root
-        same = (_object_poses(two)[:, root] - pose[:, root]).abs().amax(dim=(1, 2)) < 1e-4
-        related = same if one is found else related | same
-    assert related.all()
+        expected = module.two_ways.twin_poses(_object_poses(one))[:, root]
+        related.append((_object_poses(two)[:, root] - expected).abs().amax(dim=(1, 2)) < 1e-4)
+    assert (related[0] | related[1]).all()
 
 
 def test_a_search_without_a_network_is_decided_alike(module, clouds):
