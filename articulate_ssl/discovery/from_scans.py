@@ -2,7 +2,7 @@
 
 One view hides half of an object, and no single view is a good template. Where some objects were scanned from all sides,
 in several states each, parts and joints are found there (`grouped`); the views of the category only say how objects are
-turned in front of the camera (`mean_orientation`). What teaches the network are views of the scans, simulated
+turned in front of the camera (`view_orientations`). What teaches the network are views of the scans, simulated
 (`simulated_views`), whose poses and states are known. No label is used; which scans show the same object is.
 """
 
@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 
 from articulate_ssl.discovery.grouped import discover_grouped
-from articulate_ssl.discovery.mean_orientation import find_mean_orientation
 from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.discovery.registered_shape import RegisteredShape
 from articulate_ssl.discovery.registrar import state_starts
 from articulate_ssl.discovery.simulated_views import simulate_views
+from articulate_ssl.discovery.view_orientations import find_view_orientations
 from articulate_ssl.geometry.orientation_range import OrientationRange
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.ops.denormals import flush_denormals
@@ -56,15 +56,16 @@ def discover_from_scans(
     found, clouds = found.of_clouds(kept), clouds[kept]
     random, generator = np.random.default_rng(options.seed), torch.Generator().manual_seed(options.seed)
     mean_distance = float((views - views.mean(dim=1, keepdim=True)).norm(dim=-1).mean())
+    turns = OrientationRange().draw(len(clouds) * _VIEWS, generator)
     if orientation.limited:
         _announce(0, "how objects are turned")
-        any_way = OrientationRange().draw(len(clouds), generator)[:, None]
-        _, rough = simulate_views(found, clouds, any_way, num_points, mean_distance, random)
+        _, rough = simulate_views(found, clouds, turns[: len(clouds), None], num_points, mean_distance, random)
         rotations = rotation_group(60).elements.to(views)
         shape, states = rough.limited(), state_starts(rough.state)
-        found = found.turned(find_mean_orientation(shape, states, views[:_PROBES], rotations))
+        stand = find_view_orientations(shape, states, views[:_PROBES], rotations)
+        found, turns = found.turned(stand.mean), stand.draw(len(turns), orientation, generator)
     _announce(1, "views of the scans")
-    turns = orientation.draw(len(clouds) * _VIEWS, generator).unflatten(0, (-1, _VIEWS))
+    turns = turns.unflatten(0, (-1, _VIEWS))
     simulated = simulate_views(found, clouds, turns, num_points, mean_distance, random, reshape=True)
     _announce(2, "done")
     return simulated

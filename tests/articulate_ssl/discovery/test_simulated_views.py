@@ -9,10 +9,10 @@ import torch
 from articulated_objects import DRAWER, LAPTOP, clouds, true_shape
 
 from articulate_ssl.discovery.discover import DiscoveryError
-from articulate_ssl.discovery.mean_orientation import find_mean_orientation
 from articulate_ssl.discovery.registered_shape import RegisteredShape
 from articulate_ssl.discovery.registrar import state_starts
 from articulate_ssl.discovery.simulated_views import simulate_views
+from articulate_ssl.discovery.view_orientations import ViewOrientations, find_view_orientations
 from articulate_ssl.geometry.orientation_range import OrientationRange
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.ops.chamfer import nearest_distance
@@ -67,12 +67,33 @@ def test_views_of_too_few_points_are_left_out():
         simulate_views(found, points, turns, 1000, 0.3, np.random.default_rng(0))
 
 
-def test_the_mean_orientation_of_upright_views_is_found():
+def _upright(azimuth: float, roll: float, count: int) -> torch.Tensor:
+    """Orientations before a camera that goes round objects and is nearly upright (degrees)."""
+    generator = torch.Generator().manual_seed(1)
+    angles = (2 * torch.rand(count, 2, generator=generator) - 1) * torch.tensor([azimuth, roll]).deg2rad()
+    return roma.euler_to_rotmat("YZ", angles)
+
+
+def test_how_views_are_turned_is_found():
     points, found = _registered(LAPTOP, count=16)
     mean = roma.rotvec_to_rotmat(torch.tensor([0.4, -1.1, 2.0]))
-    turns = (OrientationRange(50).draw(len(points), torch.Generator().manual_seed(1)) @ mean)[:, None]
+    turns = (_upright(50, 8, len(points)) @ mean)[:, None]
     seen, registered = simulate_views(found, points, turns, 200, 0.3, np.random.default_rng(0))
     states = state_starts(registered.state)
-    rotation = find_mean_orientation(registered.limited(), states, seen, rotation_group(60).elements.float())
+    stand = find_view_orientations(registered.limited(), states, seen, rotation_group(60).elements.float())
     expected = roma.special_procrustes(registered.base[:, :3, :3].mean(dim=0))
-    assert roma.rotmat_geodesic_distance(rotation, expected).rad2deg() < 10
+    assert roma.rotmat_geodesic_distance(stand.mean, expected).rad2deg() < 10
+    # Measured up to a turn of the camera's frame by the error of the mean: largest about its y.
+    assert stand.covariance[1, 1] > 3 * stand.covariance[2, 2]
+    assert 20 < stand.covariance[1, 1].sqrt().rad2deg() < 45  # 50 / sqrt(3) degrees
+
+
+def test_drawn_views_are_turned_as_measured_and_stay_within_the_range():
+    covariance = torch.diag(torch.tensor([0.1, 0.5, 0.02]))
+    stand, orientation = ViewOrientations(torch.eye(3), covariance), OrientationRange(70)
+    drawn = stand.draw(2000, orientation, torch.Generator().manual_seed(0))
+    assert drawn.shape == (2000, 3, 3) and orientation.contains(drawn).all()
+    torch.testing.assert_close(torch.linalg.det(drawn), torch.ones(2000))
+    spread = roma.rotmat_to_rotvec(drawn).std(dim=0)
+    assert spread[1] > 1.3 * spread[0] > 1.6 * spread[2] > 0.2
+    assert torch.equal(drawn, stand.draw(2000, orientation, torch.Generator().manual_seed(0)))
