@@ -22,6 +22,7 @@ from articulate_ssl.discovery.discover import DiscoveryError
 from articulate_ssl.inference.checkpoint_file import CheckpointError, read_checkpoint
 from articulate_ssl.network.options import NetworkOptions
 from articulate_ssl.training.callbacks.duration import EstimateDuration
+from articulate_ssl.training.callbacks.keep_last import KeepLast
 from articulate_ssl.training.callbacks.show_progress import ShowProgress
 from articulate_ssl.training.callbacks.test_results import SendTestResults
 from articulate_ssl.training.module import ArticulatedPoseModule
@@ -36,6 +37,7 @@ IGNORED_WARNINGS = (
 
 
 WANDB_PROJECT = "articulate-ssl"  # where --wandb names none
+_CHECKPOINT_STEPS = 200  # between checkpoints
 
 
 class ArticulateCLI(LightningCLI):
@@ -183,7 +185,8 @@ def _read_given_checkpoint(arguments: list[str]) -> None:
 def _callbacks() -> list[Callback]:
     return [
         ModelCheckpoint(filename="final-{step}"),
-        ModelCheckpoint(filename="{step}", every_n_train_steps=200, save_last=True),
+        ModelCheckpoint(filename="{step}", every_n_train_steps=_CHECKPOINT_STEPS, save_last=True),
+        KeepLast(),
         EstimateDuration(),
         ShowProgress(),
         SendTestResults(),

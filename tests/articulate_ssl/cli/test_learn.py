@@ -9,7 +9,7 @@ import torch
 import yaml
 from refusal import refused
 
-from articulate_ssl.cli import main, unsaid
+from articulate_ssl.cli import learn, main, unsaid
 from articulate_ssl.training.checkpoint import load_module
 
 
@@ -90,6 +90,16 @@ def test_a_checkpoint_older_than_an_option_is_one_with_its_default(run, workplac
     del content["hyper_parameters"]["network"]["directions"]
     torch.save(content, workplace / "older.ckpt")
     assert run("validate", "-c", "laptop.yaml", "--ckpt_path", "older.ckpt", "--model.recipe=paper")[0] == 0
+
+
+def test_the_last_checkpoint_of_a_run_is_of_its_last_step(run, workplace, monkeypatch):
+    """Also where the steps are no multiple of those between checkpoints: 2 and 5."""
+    monkeypatch.setattr(learn, "_CHECKPOINT_STEPS", 2)
+    command = ("fit", "-c", "laptop.yaml", "--model.recipe=paper", "--trainer.max_steps=5")
+    assert run(*command, f"--trainer.default_root_dir={workplace / 'five'}")[0] == 0
+    (checkpoint,) = (workplace / "five").rglob("last.ckpt")
+    assert torch.load(checkpoint, weights_only=True)["global_step"] == 5
+    assert load_module(checkpoint).confidence.learnt
 
 
 def test_a_checkpoint_of_other_network_sizes_is_refused(run):
