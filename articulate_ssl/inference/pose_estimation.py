@@ -62,6 +62,9 @@ class InferenceOptions:
             closed laptop is shows in less than the spacing of the few points that suffice for the networks.
         candidates: Hypotheses that are refined; the best reconstruction wins.
         rounds: Rounds of registration.
+        most_turned: Degrees by which registration may turn a part from where the network put it; of a hypothesis that
+            it turns further, the network's word stays. 180 lets it go anywhere. Where distances count one way, nothing
+            in a cloud says that a hidden part is in the wrong place, but the network has seen where they are.
         coarse_scale: First standard deviation of the correspondences, in normalised units.
         fine_scale: Last one.
         part_neighbours: So many points of a posed part say by their mean distance how near it is to a point, which
@@ -75,6 +78,7 @@ class InferenceOptions:
     points: int = 512
     candidates: int = 4
     rounds: int = 8
+    most_turned: float = 180.0
     coarse_scale: float = 0.05
     fine_scale: float = 0.02
     part_neighbours: int | None = None
@@ -489,7 +493,27 @@ class PoseEstimator:
         candidates = hypotheses.select(last.leading(count))
         scales = options.coarse_scale, options.fine_scale
         base, state, error = self.register(candidates, points, scales, options.rounds)
-        return candidates.at(base, state), error
+        registered = candidates.at(base, state)
+        return (
+            (registered, error) if options.most_turned >= 180 else self._believed(candidates, registered, error, points)
+        )
+
+    def _believed(
+        self,
+        candidates: Hypotheses,  # H = C
+        registered: Hypotheses,  # H = C
+        error: Tensor,  # [B, C] of those
+        points: Tensor,  # [B, N, 3]
+    ) -> tuple[Hypotheses, Tensor]:
+        """Registered hypotheses, or what they were before if one of their parts was turned too far; and the errors."""
+        before, after = (some.object_pose()[..., :3, :3] for some in (candidates, registered))
+        turned = roma.rotmat_geodesic_distance(before, after).amax(dim=-1)  # [B, C]
+        kept = turned <= math.radians(self.inference.most_turned)
+        copies = points[:, None].expand(-1, error.shape[1], -1, -1).flatten(0, 1)
+        own = chamfer_l1(copies, candidates.posed().flatten(0, 1).flatten(1, 2), self.observation.bidirectional)
+        base = torch.where(kept[..., None, None], registered.base, candidates.base)
+        state = torch.where(kept[..., None], registered.state, candidates.state)
+        return candidates.at(base, state), torch.where(kept, error, own.view_as(error))
 
     def _prediction(self, chosen: Hypotheses, points: Tensor, margin: Tensor) -> Prediction:
         """Package one hypothesis per cloud."""
