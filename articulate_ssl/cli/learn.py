@@ -5,6 +5,7 @@ What the command line leaves open, `cli.unsaid` decides. `--wandb [PROJECT]` log
 
 from __future__ import annotations
 
+import signal
 import sys
 import warnings
 from dataclasses import asdict
@@ -15,6 +16,7 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.cli import LightningCLI
 from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from articulate_ssl.cli import BAD_INPUT
 from articulate_ssl.cli.unsaid import completed, given_option, newest_checkpoint
@@ -37,6 +39,7 @@ IGNORED_WARNINGS = (
 
 
 WANDB_PROJECT = "articulate-ssl"  # where --wandb names none
+TERMINATED = 128 + signal.SIGTERM  # the exit code, as a shell has it
 _CHECKPOINT_STEPS = 200  # between checkpoints
 
 
@@ -144,7 +147,8 @@ def run(arguments: list[str]) -> int:
     """Fit, validate or test, as `arguments` say.
 
     Returns:
-        Exit code: 0, or 2 for a bad configuration, data set or checkpoint, with one message on stderr.
+        Exit code: 0; 2 for a bad configuration, data set or checkpoint, with one message on stderr; 143 if SIGTERM
+        ended it.
     """
     for message in IGNORED_WARNINGS:
         warnings.filterwarnings("ignore", message)
@@ -166,6 +170,9 @@ def run(arguments: list[str]) -> int:
     except (ValueError, DiscoveryError) as error:
         print(f"lightning: {error}", file=sys.stderr)
         return BAD_INPUT
+    except SIGTERMException:  # a SystemExit without a code: whoever waits for the end would take it for success
+        print(f"lightning {arguments[0]}: terminated", file=sys.stderr)
+        return TERMINATED
     except Exception as error:
         # By name, because nothing of wandb is imported without its flag.
         if not type(error).__module__.startswith("wandb."):

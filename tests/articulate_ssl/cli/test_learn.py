@@ -1,6 +1,8 @@
 """Exit codes and messages of `lightning fit|validate|test`, in this process."""
 
 import json
+import os
+import signal
 import sys
 
 import numpy as np
@@ -11,6 +13,7 @@ from refusal import refused
 
 from articulate_ssl.cli import learn, main, unsaid
 from articulate_ssl.training.checkpoint import load_module
+from articulate_ssl.training.module import ArticulatedPoseModule
 
 
 def test_a_test_without_a_checkpoint_is_refused(run):
@@ -100,6 +103,20 @@ def test_the_last_checkpoint_of_a_run_is_of_its_last_step(run, workplace, monkey
     (checkpoint,) = (workplace / "five").rglob("last.ckpt")
     assert torch.load(checkpoint, weights_only=True)["global_step"] == 5
     assert load_module(checkpoint).confidence.learnt
+
+
+def test_a_run_that_was_terminated_did_not_succeed(run, workplace, monkeypatch):
+    """Lightning lets it end with exit code 0."""
+    step = ArticulatedPoseModule.training_step
+
+    def terminated(module, *arguments):
+        os.kill(os.getpid(), signal.SIGTERM)
+        return step(module, *arguments)
+
+    monkeypatch.setattr(ArticulatedPoseModule, "training_step", terminated)
+    command = ("fit", "-c", "laptop.yaml", "--model.recipe=paper", "--trainer.max_steps=3")
+    code, said = run(*command, f"--trainer.default_root_dir={workplace / 'terminated'}")
+    assert code == learn.TERMINATED == 143 and "terminated" in said
 
 
 def test_a_checkpoint_of_other_network_sizes_is_refused(run):
