@@ -28,8 +28,6 @@ class DiscoveryOptions:
         keep: Share of the clouds, best fitted first, that labels and joints are solved from.
         min_share: Splits with a part smaller than this share of the template are discarded.
         seed: Of the random splits.
-        reshaped: Copies of every registered cloud, with other proportions and joint states (`discovery.reshaping`),
-            that the warm-up draws from besides the cloud itself.
         grouped: The multi-state setting: which clouds show the same object is known, and templates are whole objects
             (`discovery.grouped`; for depth views `discovery.from_scans`). An easier problem than the paper's, which
             sees single clouds.
@@ -50,7 +48,6 @@ class DiscoveryOptions:
     keep: float = 0.75
     min_share: float = 0.05
     seed: int = 0
-    reshaped: int = 0
     grouped: bool = False
 
     @property

@@ -18,7 +18,7 @@ from torch.nn import functional
 from articulate_ssl.discovery.instance_fit import InstanceFit
 from articulate_ssl.discovery.one_object.surface import Surface
 from articulate_ssl.discovery.registered_shape import RegisteredShape
-from articulate_ssl.geometry.se3 import invert_se3, se3
+from articulate_ssl.geometry.se3 import invert_se3
 from articulate_ssl.ops.chamfer import nearest_index
 from articulate_ssl.shape.object_axes import object_axes
 from articulate_ssl.shape.part_maps import PartMaps
@@ -82,25 +82,6 @@ class Reshaping:
         points = torch.einsum("npij,npj->npi", _by_point(maps.linear, self._label), self._points)
         points = points + _by_point(maps.shift, self._label)
         return Reshaped(points, functional.normalize(normals, dim=-1), state)
-
-
-def with_reshaped(
-    found: RegisteredShape,
-    clouds: Tensor,  # [n, P, 3]
-    copies: int,
-    generator: torch.Generator,
-) -> tuple[Tensor, RegisteredShape]:  # [n * (1 + copies), P, 3]
-    """The clouds and, of each, copies with other proportions and states, centred alike; and the shape in all."""
-    reshaping, center = Reshaping(found, clouds), clouds.mean(dim=1)
-    points, base, state = [clouds], [found.base], [found.state]
-    for _ in range(copies):
-        drawn = reshaping.draw(generator)
-        shift = center - drawn.points.mean(dim=1)
-        points.append(drawn.points + shift[:, None])
-        base.append(se3(found.base[:, :3, :3], found.base[:, :3, 3] + shift))
-        state.append(drawn.state)
-    every = found.of_clouds(torch.arange(len(clouds)).repeat(1 + copies))
-    return torch.cat(points), replace(every, base=torch.cat(base), state=torch.cat(state))
 
 
 def _by_point(of_part: Tensor, label: Tensor) -> Tensor:

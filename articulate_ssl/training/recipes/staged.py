@@ -22,7 +22,6 @@ from articulate_ssl.discovery.from_scans import discover_from_scans
 from articulate_ssl.discovery.grouped import discover_grouped
 from articulate_ssl.discovery.proposals import load_proposals
 from articulate_ssl.discovery.registered_shape import RegisteredShape
-from articulate_ssl.discovery.reshaping import with_reshaped
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
 from articulate_ssl.inference.pose_estimation import Iteration
@@ -95,17 +94,14 @@ class TrainingRecipe(Recipe):
             found = found.with_parallel_axes()
         # All simulated views are of clouds that fit well.
         kept = slice(None) if self._simulated else found.error.argsort()[: self.discovery.kept(len(clouds))]
-        registered, shown = found.of_clouds(kept), clouds[kept]
-        if self.discovery.reshaped and not self._simulated:
-            generator = torch.Generator().manual_seed(self.discovery.seed)
-            shown, registered = with_reshaped(registered, shown, self.discovery.reshaped, generator)
+        registered = found.of_clouds(kept)
         self.found = HandOver(
-            shown[:, :num_points], registered.base, registered.state, registered.log_stretch, found.limits()
+            clouds[kept, :num_points], registered.base, registered.state, registered.log_stretch, found.limits()
         )
         network.category.adopt(found.shape)
         if found.axes is not None and not self._simulated:  # in a frame that the clouds share
             shape = network.category.articulated_shape(network.joint_type)
-            self.estimator.sliding.learn(shape, found.limits(), clouds[kept], found.base[kept])
+            self.estimator.sliding.learn(shape, found.limits(), clouds[kept], registered.base)
 
     def _discovered(self, data: TrainingClouds, num_points: int) -> tuple[Tensor, RegisteredShape]:
         """Training clouds [n, N, 3], or views that were simulated, and the category's shape registered to them."""
