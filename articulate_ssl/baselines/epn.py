@@ -13,7 +13,7 @@ from torch import Tensor
 
 from articulate_ssl.baselines.method import Method, Problem
 from articulate_ssl.geometry.se3 import se3
-from articulate_ssl.inference.pose_estimation import rivals
+from articulate_ssl.inference.candidates import rivals
 from articulate_ssl.losses.objective import rigid_loss
 from articulate_ssl.network.options import NetworkOptions
 from articulate_ssl.network.rigid_alignment import RigidAlignment

@@ -24,8 +24,8 @@ from articulate_ssl.inference.prediction import Prediction
 
 FEWEST = 60  # clouds from which it is learnt
 _CAMERA_MIRROR = (-1.0, 1.0, 1.0)  # left and right of a camera that is held upright change places
-# Category of two hands: distance between the two kinds of clouds, in standard deviations of one, and share of the rarer
-# kind. Measured: safes 3.7 and 15 %. Chosen, as is the next.
+# Of a category of two hands: distance between the two kinds of clouds, in standard deviations of one, and share of the
+# mirrored ones. Measured: safes 3.0 to 4.2, 8 to 10 % (docs/experiments.md, step 77). Chosen, as is the next.
 _LEAST_DISTANCE, _LEAST_SHARE = 2.5, 0.02
 _OUTLYING = 3.0  # medians, beyond which a difference counts as this far
 _ROUNDS = 100  # of expectation and maximisation
@@ -72,7 +72,9 @@ class Handedness(nn.Module):
         far = _OUTLYING * ratio.abs().median()
         mean, deviation, share = two_kinds(ratio.clamp(-far, far))
         distance = float(2 * mean / deviation)
-        log.info("in the mirror: two kinds of clouds %.1f deviations apart, %.0f %% the rarer", distance, 100 * share)
+        log.info(
+            "in the mirror: two kinds of clouds %.1f deviations apart, %.0f %% the mirrored", distance, 100 * share
+        )
         if distance < _LEAST_DISTANCE or share < _LEAST_SHARE:
             return
         sideways = axes[0].abs().argmax()  # upright objects stand in the mirror as they do before it

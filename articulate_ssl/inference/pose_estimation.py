@@ -17,9 +17,8 @@ Training takes the first two steps too; nothing here knows a loss or an optimise
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import roma
@@ -31,6 +30,7 @@ from articulate_ssl.discovery.search import search_articulated
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
+from articulate_ssl.inference.candidates import ANOTHER_WAY, Candidates, Iteration, rivals
 from articulate_ssl.inference.handedness import Handedness, in_the_mirror
 from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.inference.relief import NUM_FEATURES, describe_relief
@@ -41,14 +41,12 @@ from articulate_ssl.network.articulated_network import ArticulatedNetwork
 from articulate_ssl.network.heads.shape import CanonicalShape
 from articulate_ssl.network.hypotheses import Hypotheses, either
 from articulate_ssl.network.rigid_alignment import RigidAlignment
-from articulate_ssl.ops.chamfer import chamfer, hypothesis_distances, nearest_distance
+from articulate_ssl.ops.chamfer import chamfer, hypothesis_distances
 from articulate_ssl.ops.kd_tree import kd_tree
 from articulate_ssl.shape.observation import Observation
 from articulate_ssl.shape.stretch import principal_directions
 
-_ANOTHER_WAY = math.radians(30)  # beyond, one of two hypotheses is wrong (`metrics.above_30_rate`)
 _SIDE = 1 / 3  # of the width of a joint's range, from its middle, where a search without a network starts, too
-_AGREEING_POINTS = 64  # of a cloud, farthest-point order: which way round its parts are shows in few
 
 
 @dataclass(frozen=True)
@@ -83,107 +81,6 @@ class InferenceOptions:
     fine_scale: float = 0.02
     part_neighbours: int | None = None
     columns: bool = False
-
-
-def rivals(
-    error: Tensor,  # [B, C] of the hypotheses
-    base: Tensor,  # [B, C, 4, 4]
-    chosen: Tensor,  # [B]
-    allowed: Tensor,  # [B, C] bool, which ones may be rivals
-) -> tuple[Tensor, Tensor]:  # [B], [B]
-    """Rivals of chosen hypotheses, the best ones that are turned another way, and `Prediction.margin`.
-
-    Where none is turned another way, the chosen one is its own rival, and the margin 1.
-    """
-    rows = torch.arange(len(chosen), device=chosen.device)
-    rotation = base[..., :3, :3]
-    angle = roma.rotmat_geodesic_distance(rotation, rotation[rows, chosen, None].expand_as(rotation))
-    least, rival = error.masked_fill(~allowed | (angle < _ANOTHER_WAY), torch.inf).min(dim=1)
-    return torch.where(least.isinf(), chosen, rival), (1 - error[rows, chosen] / least).clamp(0, 1)
-
-
-@torch.no_grad()
-def part_distances(
-    points: Tensor,  # [B, C, 3]
-    posed: Tensor,  # [B, H, K, M, 3]
-    association: Tensor,  # [B, C, K], rows sum to one
-) -> Tensor:  # [B, H]
-    """Mean distance of points to the parts that they belong to, of every hypothesis, for choosing among them."""
-    result = 0.0
-    for part, weight in zip(posed.unbind(2), association.unbind(-1), strict=True):
-        query = points[:, None].expand(-1, part.shape[1], -1, -1)
-        result = result + (nearest_distance(query, part) * weight[:, None]).mean(dim=-1)
-    return result
-
-
-@dataclass(frozen=True)
-class Iteration:
-    """One pose estimation of clouds.
-
-    Attributes:
-        points: [B, N, 3] the clouds, aligned.
-        hypotheses: One per group element.
-        start: The estimate that the hypotheses are residuals to (the winner of the iteration before), or None.
-        observation: How hypotheses are compared; those that are turned too far are the last to be chosen.
-        agreement: Weight, beside d(X, Y^g), of the distance to the parts that the slot attention assigns.
-        compared: So many points of a cloud, and as many of a hypothesis, are compared; None compares all.
-    """
-
-    points: Tensor
-    hypotheses: Hypotheses
-    start: Hypotheses | None
-    observation: Observation
-    agreement: float = 0.0
-    compared: int | None = None
-
-    @cached_property
-    @torch.no_grad()
-    def distance(self) -> Tensor:
-        """d(X, Y^g) of every hypothesis, and that of its parts to theirs if that counts, [B, H], without gradient."""
-        posed = self.hypotheses.posed(self._every)
-        points = self.points[:, : self.compared]
-        whole = hypothesis_distances(points, posed.flatten(2, 3), bidirectional=self.observation.bidirectional)
-        if self.agreement == 0:
-            return whole
-        logits = self.hypotheses.association_logits[:, :_AGREEING_POINTS]
-        return whole + self.agreement * part_distances(self.points[:, : logits.shape[1]], posed, logits.softmax(dim=-1))
-
-    @property
-    def _every(self) -> int:
-        """Of the points of a part one in so many is compared."""
-        if self.compared is None:
-            return 1
-        parts, shape_points = self.hypotheses.part_shape.shape[1:3]
-        return max(1, parts * shape_points // self.compared)
-
-    @property
-    def winner(self) -> Tensor:
-        """argmin_g d(X, Y^g), [B]."""
-        return self.leading(1)[:, 0]
-
-    def leading(self, count: int) -> Tensor:
-        """The hypotheses of the smallest d(X, Y^g), best first, [B, count]."""
-        return self.ranked.topk(count, largest=False).indices
-
-    @cached_property
-    def ranked(self) -> Tensor:
-        """`distance`, larger than all others where a hypothesis is turned too far, [B, H]."""
-        return self.observation.ranked(self.distance, self.hypotheses.base[..., :3, :3])
-
-
-@dataclass(frozen=True)
-class Candidates:
-    """Explanations of clouds, among which one is chosen.
-
-    Attributes:
-        error: [B, C] of each.
-        base: [B, C, 4, 4] base poses.
-        select: One of each cloud, by its index [B], as H = 1.
-    """
-
-    error: Tensor
-    base: Tensor
-    select: Callable[[Tensor], Hypotheses]
 
 
 class PoseEstimator:
@@ -408,7 +305,7 @@ class PoseEstimator:
             return first, rival, margin
         error = chamfer_l1(points, first.posed()[:, 0].flatten(1, 2), self.observation.bidirectional)
         turn = first.base[:, :, :3, :3].expand_as(others.base[..., :3, :3])
-        away = roma.rotmat_geodesic_distance(others.base[..., :3, :3], turn) > _ANOTHER_WAY
+        away = roma.rotmat_geodesic_distance(others.base[..., :3, :3], turn) > ANOTHER_WAY
         least, index = others.error.masked_fill(away, torch.inf).min(dim=1)
         return either(error <= least, first, others.select(index)), rival, margin
 
@@ -494,9 +391,9 @@ class PoseEstimator:
         scales = options.coarse_scale, options.fine_scale
         base, state, error = self.register(candidates, points, scales, options.rounds)
         registered = candidates.at(base, state)
-        return (
-            (registered, error) if options.most_turned >= 180 else self._believed(candidates, registered, error, points)
-        )
+        if options.most_turned >= 180:
+            return registered, error
+        return self._believed(candidates, registered, error, points)
 
     def _believed(
         self,

@@ -59,7 +59,7 @@ from articulate_ssl.baselines.perfect_oracle import part_points
 from articulate_ssl.geometry.orientation_range import OrientationRange
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
-from articulate_ssl.inference.pose_estimation import rivals
+from articulate_ssl.inference.candidates import rivals
 from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.network.options import NetworkOptions
 from articulate_ssl.ops.chamfer import chamfer

@@ -24,7 +24,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from articulate_ssl.inference.pose_estimation import Iteration
+from articulate_ssl.inference.candidates import Iteration
 from articulate_ssl.losses.balanced_assignment import balanced_assignment
 from articulate_ssl.losses.objective import paper_terms
 from articulate_ssl.ops.ranks import of_all_ranks, own_rows

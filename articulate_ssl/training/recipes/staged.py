@@ -24,7 +24,7 @@ from articulate_ssl.discovery.proposals import load_proposals
 from articulate_ssl.discovery.registered_shape import RegisteredShape
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
-from articulate_ssl.inference.pose_estimation import Iteration
+from articulate_ssl.inference.candidates import Iteration
 from articulate_ssl.losses.objective import PoseTarget, staged_terms
 from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.ops.ranks import own_rows, world

@@ -13,7 +13,7 @@ from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.geometry.orientation_range import OrientationRange, mean_rotation
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import se3
-from articulate_ssl.inference.pose_estimation import Iteration
+from articulate_ssl.inference.candidates import Iteration
 from articulate_ssl.shape.observation import Observation
 
 # Two like plates and a hinge: turned by 180 degrees about the line between the plates, each is where the other was.

@@ -4,7 +4,7 @@ import roma
 import torch
 
 from articulate_ssl.geometry.se3 import se3
-from articulate_ssl.inference.pose_estimation import rivals
+from articulate_ssl.inference.candidates import rivals
 
 
 def _turned(degrees: list[float]) -> torch.Tensor:
