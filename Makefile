@@ -101,7 +101,7 @@ demo: $(needs) ## Set up without compiling, predict a real laptop, make its twin
 	@find "$$PWD/build/demo/run" -name metrics.json -o -name '*.png' | sed 's/^/  /'
 	@echo 'A view.html opens in any browser, without a network. With a server: .venv/bin/articulate-ssl view build/demo/twin'
 
-weights: $(needs) ## Make all shipped weights anew: 12 to 35 minutes each on a CPU, can be interrupted. [CATEGORIES="laptop oven" VIEWS="depth complete"]
+weights: $(needs) ## Make all shipped weights anew: 12 to 45 minutes each on a CPU, can be interrupted. [CATEGORIES="laptop oven" VIEWS="depth complete"]
 	$(bin)/articulate-ssl weights rebuild $(if $(CATEGORIES),--categories $(CATEGORIES)) $(if $(VIEWS),--views $(VIEWS))
 
 weights-check: $(needs) ## Test shipped weights on fresh data and compare with their cards. [CATEGORIES="laptop oven-depth" SEED=12]
