@@ -1,8 +1,9 @@
-"""Parts that slide side by side are kept apart.
+"""Parts that move side by side are kept apart.
 
-The drawers of a chest never meet: a plane along the direction in which they slide is between any two of them. Points
-that were taken for the wrong drawer lie beyond it, and one such point makes the hulls of two drawers, which is what
-simulators collide, block each other. So every part is cut off at these planes, and a little before them.
+The drawers of a chest never meet: a plane along the direction in which they slide is between any two of them. Nor do
+the doors of a fridge-freezer: a plane across their hinges is. Points that were taken for the wrong part lie beyond it,
+and one such point makes the hulls of two parts, which is what simulators collide, block each other. So every part is
+cut off at these planes, and a little before them.
 """
 
 from __future__ import annotations
@@ -14,15 +15,31 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 
-from articulate_ssl.inference.export.hollow import Slide, closed_difference
+from articulate_ssl.inference.export.hollow import closed_difference
 
-PARALLEL = np.cos(np.deg2rad(5))  # found axes of parts that slide one way differ by a degree or less
+PARALLEL = np.cos(np.deg2rad(5))  # found axes of parts that move one way differ by a degree or less
 DIRECTIONS = 90  # that are tried across the axis: every two degrees
-# Of the points of either part that may lie beyond the plane; more, and one slides within the other. A third of a
+# Of the points of either part that may lie beyond the plane; more, and one moves within the other. A third of a
 # drawer's points were wrong on the worst twin (IoU .68).
 MOST_BEYOND = 0.3
 LEAST_KEPT = 0.25  # of a part's points: less tells no shape. Chosen without a measurement, as is the next
 CLEARANCE = 0.002  # between two parts, half of it on either side; of the larger one's extent
+
+
+class Motion(NamedTuple):
+    """How a part moves on another.
+
+    Attributes:
+        parent: Number of the part that stays.
+        child: Number of the part that moves.
+        axis: [3] unit, along which it slides or about which it turns.
+        turns: Which of the two.
+    """
+
+    parent: int
+    child: int
+    axis: np.ndarray
+    turns: bool
 
 
 class HalfSpace(NamedTuple):
@@ -46,14 +63,16 @@ class HalfSpace(NamedTuple):
 
 def half_spaces(
     points: Sequence[np.ndarray],  # K of [M, 3], in one space while all states are zero
-    slides: Sequence[Slide],
+    motions: Sequence[Motion],
 ) -> list[list[HalfSpace]]:
-    """Where each part must stay, so that those that slide side by side on one part never meet."""
+    """Where each part must stay, so that those that move side by side on one part, in one way, never meet."""
     found: list[list[HalfSpace]] = [[] for _ in points]
-    for a, b in combinations(slides, 2):
-        if a.parent != b.parent or abs(a.axis @ b.axis) < PARALLEL:
+    for a, b in combinations(motions, 2):
+        if a.parent != b.parent or a.turns != b.turns or abs(a.axis @ b.axis) < PARALLEL:
             continue
-        plane = _plane_between(points[a.child], points[b.child], a.axis)
+        # Only along such normals does what moves never come nearer to the plane.
+        normals = np.stack([a.axis, -a.axis]) if a.turns else _across(a.axis)
+        plane = _plane_between(points[a.child], points[b.child], normals)
         if plane is not None:
             clearance = CLEARANCE / 2 * max(np.ptp(points[part], axis=0).max() for part in (a.child, b.child))
             found[a.child].append(plane._replace(offset=plane.offset - clearance))
@@ -70,15 +89,19 @@ def kept(
     return points[inside] if inside.mean() >= LEAST_KEPT else points
 
 
+def _across(axis: np.ndarray) -> np.ndarray:
+    """Directions [D, 3] at right angles to an axis [3], all the way round."""
+    across = np.linalg.svd(axis[None])[2][1:]  # [2, 3]
+    angle = 2 * np.pi * np.arange(2 * DIRECTIONS) / (2 * DIRECTIONS)
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1) @ across
+
+
 def _plane_between(
     points: np.ndarray,  # [M, 3]
     others: np.ndarray,  # [M', 3]
-    axis: np.ndarray,  # [3] unit
+    normals: np.ndarray,  # [D, 3] unit
 ) -> HalfSpace | None:
-    """The plane along the axis with the fewest points beyond it, `points` below; None if too many are."""
-    across = np.linalg.svd(axis[None])[2][1:]  # [2, 3]
-    angle = 2 * np.pi * np.arange(2 * DIRECTIONS) / (2 * DIRECTIONS)
-    normals = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ across
+    """The plane with the fewest points beyond it, `points` below; None if too many are."""
     best, wrong, margin = None, MOST_BEYOND, 0.0
     for normal in normals:
         place = np.concatenate([points @ normal, others @ normal])

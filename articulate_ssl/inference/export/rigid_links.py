@@ -21,7 +21,7 @@ import trimesh
 
 from articulate_ssl.geometry.screw import screw_motion
 from articulate_ssl.inference.articulation import canonical_object
-from articulate_ssl.inference.export.apart import half_spaces, kept, trimmed
+from articulate_ssl.inference.export.apart import Motion, half_spaces, kept, trimmed
 from articulate_ssl.inference.export.hollow import Slide, hollow_parents
 from articulate_ssl.inference.export.part_mesh import part_mesh
 from articulate_ssl.inference.pictures.part_colour import part_colour
@@ -143,7 +143,7 @@ class RigidObject:
 def rigid_object(result: ScanPrediction) -> RigidObject:
     """Links and joints of a prediction; limits are widened to hold the predicted states.
 
-    Parts that slide side by side do not meet (`apart`), and what slides through a part is cut out of it (`hollow`).
+    Parts that move side by side do not meet (`apart`), and what slides through a part is cut out of it (`hollow`).
     """
     prediction = result.prediction
     child = prediction.joint_child[0].tolist()
@@ -155,8 +155,9 @@ def rigid_object(result: ScanPrediction) -> RigidObject:
         _joint(prediction, j, origin, limits, extent) for j, limits in enumerate(result.limits.double().numpy())
     )
     slides = [Slide(j.parent, j.child, j.axis, j.lower, j.upper) for j in joints if j.kind == "prismatic"]
+    motions = [Motion(j.parent, j.child, j.axis, j.kind == "revolute") for j in joints]
     meshes = []
-    for shape, spaces in zip(shapes, half_spaces(shapes, slides), strict=True):
+    for shape, spaces in zip(shapes, half_spaces(shapes, motions), strict=True):
         mesh = _with_substance(_remembered_mesh(kept(shape, spaces).tobytes()), MIN_PART * extent)
         meshes.append(trimmed(mesh, spaces))
     meshes = hollow_parents(meshes, slides)

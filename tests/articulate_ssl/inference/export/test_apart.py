@@ -1,4 +1,4 @@
-"""Parts that slide side by side do not meet, even if some of their points were taken for the other's."""
+"""Parts that move side by side do not meet, even if some of their points were taken for the other's."""
 
 import numpy as np
 import pytest
@@ -8,8 +8,8 @@ import trimesh
 from scan_predictions import result_of
 
 from articulate_ssl.inference.export import mjcf, rigid_links, urdf
-from articulate_ssl.inference.export.apart import MOST_BEYOND, half_spaces, kept, trimmed
-from articulate_ssl.inference.export.hollow import Slide, shared_volume
+from articulate_ssl.inference.export.apart import MOST_BEYOND, Motion, half_spaces, kept, trimmed
+from articulate_ssl.inference.export.hollow import shared_volume
 from articulate_ssl.inference.export.physics_check import check
 from articulate_ssl.inference.export.rigid_links import rigid_object
 
@@ -17,8 +17,12 @@ AXIS = np.array([0.6, 0.0, 0.8])
 RANGES = torch.tensor([[-0.02, 0.3]]).repeat(3, 1)
 
 
-def slides(*axes) -> list[Slide]:
-    return [Slide(0, child, np.array(axis), 0.0, 0.3) for child, axis in enumerate(axes, start=1)]
+def slides(*axes) -> list[Motion]:
+    return [Motion(0, child, np.array(axis), turns=False) for child, axis in enumerate(axes, start=1)]
+
+
+def doors(*axes) -> list[Motion]:
+    return [Motion(0, child, np.array(axis), turns=True) for child, axis in enumerate(axes, start=1)]
 
 
 def two_rods(wrong: float) -> list[np.ndarray]:
@@ -48,8 +52,27 @@ def test_parts_that_are_in_each_other_or_slide_elsewhere_are_left_alone():
     points = two_rods(0.0)
     assert half_spaces(points, slides(AXIS, (0.0, 1.0, 0.0))) == [[], [], []]
     assert half_spaces(two_rods(MOST_BEYOND + 0.05), slides(AXIS, AXIS)) == [[], [], []]
-    chain = [Slide(0, 1, AXIS, 0.0, 0.1), Slide(1, 2, AXIS, 0.0, 0.1)]
+    chain = [Motion(0, 1, AXIS, turns=False), Motion(1, 2, AXIS, turns=False)]
     assert half_spaces(points, chain) == [[], [], []]
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.1, 0.25])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_doors_above_each_other_are_kept_apart_across_their_hinges(wrong, sign):
+    points = two_rods(wrong)  # stacked in y
+    spaces = half_spaces(points, doors((0, 1.0, 0), (0, sign * 1.0, 0)))
+    assert spaces[0] == [] and len(spaces[1]) == len(spaces[2]) == 1
+    low, high = (kept(points[part], spaces[part]) for part in (1, 2))
+    assert low[:, 1].max() <= 0.1 and high[:, 1].min() >= 0.2
+    for (space,) in spaces[1:]:
+        assert abs(space.normal[1]) == pytest.approx(1)  # turning changes nothing
+
+
+def test_doors_beside_each_other_and_a_door_beside_a_drawer_are_left_alone():
+    points = two_rods(0.0)
+    # No plane that both doors keep to parts them: between their closed leaves is one, through which they swing.
+    assert half_spaces(points, doors(AXIS, AXIS)) == [[], [], []]
+    assert half_spaces(points, doors(AXIS)[:1] + slides(AXIS, AXIS)[1:]) == [[], [], []]
 
 
 def test_plates_face_to_face_keep_their_points():
@@ -90,7 +113,7 @@ def test_a_chest_with_wrong_points_passes_the_check_only_so(tmp_path, monkeypatc
     assert verdict(tmp_path / "apart").passed
     drawers = [link.mesh for link in rigid_object(result_of(wrong_chest, state_range=RANGES)).links[1:]]
     assert max(shared_volume(a, b) for a, b in zip(drawers, drawers[1:] + drawers[:1], strict=True)) < 1e-9
-    monkeypatch.setattr(rigid_links, "half_spaces", lambda shapes, slides: [[] for _ in shapes])
+    monkeypatch.setattr(rigid_links, "half_spaces", lambda shapes, motions: [[] for _ in shapes])
     assert not verdict(tmp_path / "blocked").passed
 
 
