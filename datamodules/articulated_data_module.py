@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +16,8 @@ from torch.utils.data import DataLoader
 from datamodules.articulated_dataset import ArticulatedDataset, Batch, clouds_of_objects, evenly, spread_subset
 from datamodules.manifest import MANIFEST_NAME, Manifest, ManifestError, set_folder
 from datamodules.samplers import EvaluationSampler, TrainingStream
+
+log = logging.getLogger(__name__)
 
 
 class ArticulatedDataModule(LightningDataModule):
@@ -203,27 +206,59 @@ class ArticulatedDataModule(LightningDataModule):
             samples: How many.
             per_object: Fewest and most clouds of an object, where clouds of the same objects are wanted
                 (`clouds_of_objects`). Which object a cloud shows is known from the recording; it is no label.
-            scans: Of the set `scans` instead, if one is named.
+            scans: Of the set `scans` instead, if one is named, but for objects that this set's test split shows.
 
         Raises:
-            ManifestError: if that set is of another category, or not of complete clouds.
+            ManifestError: if that set is of another category, not of complete clouds, or only of such objects.
         """
-        folder, manifest = self.folder, self.manifest
-        if scans and self.hparams.scans is not None:
-            folder = Path(self.hparams.scans)
-            manifest = Manifest.load(folder)
-            if (manifest.category, manifest.view) != (self.hparams.category, "complete"):
-                raise ManifestError(
-                    f"{folder}: holds {manifest.view} clouds of {manifest.category}; data.scans takes complete clouds "
-                    f"of {self.hparams.category}"
-                )
+        other = scans and self.hparams.scans is not None
+        folder, manifest = (Path(self.hparams.scans), self._scans) if other else (self.folder, self.manifest)
         rotate, verify = manifest.view == "complete", self.hparams.verify
         dataset = ArticulatedDataset(folder, "train", self.hparams.num_points, rotate, verify=verify)
+        rows = np.arange(len(dataset))
+        if other:
+            tested = [manifest.instances["train"].index(one) for one in self._scanned_test_objects]
+            rows = rows[~np.isin(dataset.labels["instance"], tested)]
         if per_object is None:
-            chosen = evenly(np.arange(len(dataset)), samples)
+            chosen = evenly(rows, samples)
         else:
-            chosen = clouds_of_objects(dataset.labels["instance"], samples, *per_object)
+            chosen = rows[clouds_of_objects(dataset.labels["instance"][rows], samples, *per_object)]
         return self._loader(dataset, EvaluationSampler(np.random.default_rng(self.hparams.seed).permutation(chosen)))
+
+    @cached_property
+    def _scans(self) -> Manifest:
+        """Of the set `scans`."""
+        folder = self.hparams.scans
+        manifest = Manifest.load(folder)
+        if (manifest.category, manifest.view) != (self.hparams.category, "complete"):
+            raise ManifestError(
+                f"{folder}: holds {manifest.view} clouds of {manifest.category}; data.scans takes complete clouds "
+                f"of {self.hparams.category}"
+            )
+        return manifest
+
+    @cached_property
+    def _scanned_test_objects(self) -> list[str]:
+        """Objects of this set's test split whose scans would teach: they are left out, or the test would flatter."""
+        if self.manifest.split_by == "scan":  # of one object, which is in both splits
+            return []
+        scanned = self._scans.instances["train"]
+        tested = self._scans.also_in(self.manifest, "test")
+        found = [one for one in scanned if one in tested]
+        if len(found) == len(scanned):
+            raise ManifestError(
+                f"{self.hparams.scans}: all {len(found)} scanned objects are in the test split of {self.folder}, and "
+                "would teach what is tested; scan others (of generated ones: another SEED)"
+            )
+        if found:
+            log.warning(
+                "%d of %d scanned objects are in the test split of %s; their scans are left out: %s",
+                len(found),
+                len(scanned),
+                self.folder,
+                ", ".join(found),
+            )
+        return found
 
     def on_before_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
         """Count what training consumes here, where loaders cannot run ahead of it."""

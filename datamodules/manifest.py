@@ -126,6 +126,25 @@ class Manifest:
         """Number of samples of a split."""
         return sum(shard.samples for shard in self.shards[split])
 
+    def also_in(
+        self,
+        other: Manifest,
+        split: str,
+    ) -> set[str]:
+        """Ids of the objects of this set that a split of another set shows, too.
+
+        External objects are known by their ids. Generated ones have numbers for ids, which mean the same objects only
+        under the same seed and variant.
+        """
+
+        def origin(manifest: Manifest) -> tuple:
+            drawn = (manifest.seed, manifest.options.get("variant")) if manifest.source == "procedural" else ()
+            return manifest.category, manifest.source, *drawn
+
+        if origin(self) != origin(other):
+            return set()
+        return {i for ids in self.instances.values() for i in ids} & set(other.instances[split])
+
     def save(self, folder: str | os.PathLike) -> None:
         """Write `manifest.json` into `folder`, atomically; equal manifests give equal bytes."""
         text = json.dumps(asdict(self), indent=2, sort_keys=True, allow_nan=False) + "\n"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,7 +16,7 @@ from torch.utils.data import DistributedSampler
 from unlabelled import without_labels
 
 from datamodules.articulated_data_module import ArticulatedDataModule
-from datamodules.manifest import ManifestError
+from datamodules.manifest import Manifest, ManifestError
 from datamodules.shards import ShardError
 
 
@@ -181,6 +182,44 @@ def test_clouds_for_discovery_are_those_of_whole_objects_if_that_is_asked_for(tm
 def test_clouds_for_discovery_are_chosen_as_ever_where_objects_do_not_matter(tmp_path, synthetic_set):
     samples = torch.cat([batch["sample"] for batch in data(tmp_path).discovery_dataloader(5)])
     assert samples.tolist() == [6, 11, 8, 0, 3]
+
+
+def scans_of(tmp_path: Path, *train: str, **changes) -> ArticulatedDataModule:
+    """Depth views, and scans beside them whose training objects have these names; the views test test-0 and test-1."""
+    write_synthetic_set(tmp_path, view="partial", protocol="honest")
+    folder = write_synthetic_set(tmp_path, train_instances=len(train), test_instances=0)
+    names = {"instances": {"train": train, "test": ()}, "rest_state": {one: (0.0,) for one in train}}
+    replace(Manifest.load(folder), **names | changes).save(folder)
+    return data(tmp_path, view="partial", scans=str(folder))
+
+
+def test_scans_of_objects_that_views_test_teach_nothing(tmp_path, caplog):
+    module = scans_of(tmp_path, "train-0", "test-1", "other")
+    shown = torch.cat([batch["instance"] for batch in module.discovery_dataloader(100, scans=True)])
+    assert set(shown.tolist()) == {0, 2}
+    whole = torch.cat([batch["instance"] for batch in module.discovery_dataloader(8, (4, 4), scans=True)])
+    assert whole.unique(return_counts=True)[1].tolist() == [4, 4] and 1 not in whole
+    assert len(caplog.records) == 1 and "1 of 3 scanned objects" in caplog.text and "test-1" in caplog.text
+
+
+@pytest.mark.parametrize("change", [{"seed": 1}, {"options": {"variant": "both_sides"}}, {"source": "urdf"}])
+def test_objects_of_other_origin_only_have_the_same_names(tmp_path, change, caplog):
+    module = scans_of(tmp_path, "test-0", "test-1", **change)
+    shown = torch.cat([batch["instance"] for batch in module.discovery_dataloader(100, scans=True)])
+    assert set(shown.tolist()) == {0, 1} and not caplog.records
+
+
+def test_scans_of_nothing_but_objects_that_views_test_are_refused(tmp_path):
+    with pytest.raises(ManifestError, match=r"all 2 scanned objects are in the test split of .*another SEED"):
+        scans_of(tmp_path, "test-0", "test-1").discovery_dataloader(100, scans=True)
+
+
+def test_a_category_of_one_object_is_learnt_from_its_scans(tmp_path):
+    module = scans_of(tmp_path, "test-0")
+    replace(module.manifest, split_by="scan").save(module.folder)
+    del module.manifest
+    shown = torch.cat([batch["instance"] for batch in module.discovery_dataloader(100, scans=True)])
+    assert set(shown.tolist()) == {0}
 
 
 def test_partial_clouds_are_not_rotated(tmp_path):
