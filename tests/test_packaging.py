@@ -14,7 +14,7 @@ ROOT = Path(__file__).parent.parent
 # From low to high: a folder of articulate_ssl imports itself and lower ones only (docs/architecture.md).
 LAYERS = (
     *("geometry", "ops", "shape", "network", "losses", "discovery", "inference"),
-    *("metrics", "baselines", "training", "pretrained", "comparison", "benchmark", "cli"),
+    *("metrics", "baselines", "training", "pretrained", "comparison", "paper_figures", "benchmark", "cli"),
 )
 # Of articulate_ssl, geometry is everybody's.
 FORBIDDEN = {

@@ -72,9 +72,7 @@ class ArticulatedNetwork(nn.Module):
         With an estimate they are residuals to it (iterated pose estimation).
         """
         if estimate is not None:
-            pose = invert_se3(estimate.object_pose()[:, 0].detach())
-            pose = pose[torch.arange(len(points), device=points.device)[:, None], labels]
-            points = (pose[..., :3, :3] @ points[..., None]).squeeze(-1) + pose[..., :3, 3]
+            points = in_part_frames(points, estimate, labels)
         mean = points.mean(dim=1, keepdim=True)
         logits, equivariant = self._part_features(points, mean)
         invariant = self.part_pool(equivariant)
@@ -88,6 +86,13 @@ class ArticulatedNetwork(nn.Module):
             state = estimate.state.detach() + state
             base = estimate.base.detach() @ base
         return Hypotheses(shape, structure, base, state, logits)
+
+    def point_features(
+        self,
+        points: Tensor,  # [B, N, 3], or the same in the frames of their parts
+    ) -> Tensor:  # [B, C, D] of the first C points
+        """Invariant features, pooled over the group; points in part frames have part-level equivariant ones."""
+        return self.point_pool(self.backbone(points).to(points.dtype))
 
     def category_at(
         self,
@@ -134,3 +139,14 @@ class ArticulatedNetwork(nn.Module):
         if self.shared_axis:
             axis = axis[:, :, :1].expand_as(axis)
         return Structure(confidence, pair_pivot, pair_axis, pivot, axis, chain, self.joint_type)
+
+
+def in_part_frames(
+    points: Tensor,  # [B, N, 3]
+    estimate: Hypotheses,  # H = 1
+    labels: Tensor,  # [B, N] parts by that estimate
+) -> Tensor:  # [B, N, 3]
+    """Every point in the estimated frame of its part: what pose-aware convolution reads (paper, Sec. 3.1)."""
+    pose = invert_se3(estimate.object_pose()[:, 0].detach())
+    pose = pose[torch.arange(len(points), device=points.device)[:, None], labels]
+    return (pose[..., :3, :3] @ points[..., None]).squeeze(-1) + pose[..., :3, 3]
