@@ -35,9 +35,10 @@ from articulate_ssl.shape.observation import Observation
 
 MOST_CLOUDS = 16  # of an object that are looked at: time goes with their square; more were not tried
 
-# Objects are no templates of which this many times as many points are unexplained as of the best understood one: of
-# washing machines .3 to .6 % where parts were right, 2.4 % where a door was turned by 16 degrees (step 71).
-_MOST_UNEXPLAINED = 2.0
+# Objects are no templates of which more than this share of the points is unexplained, and this many times as many as
+# of the best understood one: of washing machines .06 to .8 % where parts were right, 2.4 to 5 % where a door was turned
+# by 10 degrees and more (docs/experiments.md, steps 71 and 84).
+_UNDERSTOOD, _MOST_UNEXPLAINED = 0.01, 2.0
 
 log = logging.getLogger(__name__)
 
@@ -88,11 +89,11 @@ def discover_grouped(
             f"part discovery found the parts of none of {len(objects)} objects in the clouds of each: check number of "
             "parts and the type of joint, allow more --model.discovery.references, or leave grouped out"
         )
-    least = min(template.unexplained for template in templates)
+    most = max(_UNDERSTOOD, _MOST_UNEXPLAINED * min(template.unexplained for template in templates))
     candidates = [
         registrar.register(template.shape, collection.few)
         for template in templates
-        if template.unexplained <= _MOST_UNEXPLAINED * least
+        if template.unexplained <= most
     ]
     found = registrar.register(min(candidates, key=lambda c: _error(c, options)), collection.clouds)
     _announce(len(objects) + 1, of_object, "done")

@@ -36,6 +36,7 @@ COMPLETE_OPTIONS = ("--train-instances", "1000", "--test-instances", "100", "--s
 MULTI_STATE = (
     ("drawer", "complete"),
     ("desk_lamp", "complete"),
+    ("washing_machine", "complete"),
     ("safe", "depth"),
     ("washing_machine", "depth"),
     ("desk_lamp", "depth"),
