@@ -91,9 +91,7 @@ def discover_grouped(
         )
     most = max(_UNDERSTOOD, _MOST_UNEXPLAINED * min(template.unexplained for template in templates))
     candidates = [
-        registrar.register(template.shape, collection.few)
-        for template in templates
-        if template.unexplained <= most
+        registrar.register(template.shape, collection.few) for template in templates if template.unexplained <= most
     ]
     found = registrar.register(min(candidates, key=lambda c: _error(c, options)), collection.clouds)
     _announce(len(objects) + 1, of_object, "done")

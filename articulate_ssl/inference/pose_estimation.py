@@ -17,7 +17,7 @@ Training takes the first two steps too; nothing here knows a loss or an optimise
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -260,11 +260,12 @@ class PoseEstimator:
         self,
         points: Tensor,  # [B, N, 3] normalised, farthest-point order
         num_points: int,
-        dense: Tensor,  # [B, P, 3] the same clouds with all their points
-    ) -> tuple[Tensor, Tensor]:  # [B, F], [B, F]
-        """The relief of predictions and of their twins, from which `two_ways` learns to decide."""
+        dense: Sequence[Tensor],  # of [B, P, 3] the same clouds with all their points
+    ) -> list[tuple[Tensor, Tensor]]:  # of [B, F], [B, F]
+        """The relief of predictions and of their twins, from which `two_ways` learns to decide, in each of `dense`."""
         chosen, _, _ = self._best(self._candidates(points, num_points, registers=True))
-        return self._relief(chosen, dense), self._relief(self._twin(chosen, points, registers=True), dense)
+        twin = self._twin(chosen, points, registers=True)
+        return [(self._relief(chosen, clouds), self._relief(twin, clouds)) for clouds in dense]
 
     def _candidates(self, points: Tensor, num_points: int, registers: bool) -> Candidates:
         """The network's hypotheses, or the leading ones registered, in the frame of the points."""

@@ -8,7 +8,9 @@ for all clouds. So from the relief of both explanations of many clouds (`relief`
    This is the same for all clouds, so the most frequent one among the rivals that predictions come with is taken;
 2. the *decision*: a direction in which the differences of reliefs, whose signs nobody knows, fall into two clusters
    opposite each other: least kurtosis among whitened principal directions, and from there discriminant analysis on
-   its own answers until these stay. Of several starts the one that parts the clusters best wins.
+   its own answers until these stay. Of several starts the one that parts the clusters best wins. Last, discriminant
+   analysis of the same answers on the clouds as they are and with noise on their points, which hides what is fine: what
+   a scanner leaves of it must weigh no more than it is worth.
 
 Which of the two clusters is called right does not matter: slots have no names, and whatever relates them to labels is
 fitted to the answers (`metrics.calibration`).
@@ -110,16 +112,18 @@ class TwoWays(nn.Module):
 
     def learn_decision(
         self,
-        one: Tensor,  # [n, F] relief of explanations
-        other: Tensor,  # [n, F] of their twins
+        clean: tuple[Tensor, Tensor],  # [n, F] relief of explanations, [n, F] of their twins
+        noisy: tuple[Tensor, Tensor],  # the same with noise on the clouds' points
     ) -> bool:
         """Find the direction that parts the differences. False, if there are too few."""
-        difference = (one - other).double().cpu().numpy()
-        difference = difference[np.isfinite(difference).all(axis=1)]
-        if len(difference) < FEWEST:
+        differences = np.stack([(one - other).double().cpu().numpy() for one, other in (clean, noisy)])  # [2, n, F]
+        differences = differences[:, np.isfinite(differences).all(axis=(0, 2))]
+        if differences.shape[1] < FEWEST:
             return False
-        scale = np.sqrt((difference**2).mean(axis=0)) + 1e-9
-        weight = decision_direction(np.clip(difference / scale, -_CAP, _CAP))
+        standardised, _ = _standardised(differences[0])
+        answers = np.sign(standardised @ decision_direction(standardised))
+        standardised, scale = _standardised(np.concatenate(list(differences)))
+        weight = _discriminant(standardised, np.tile(answers, 2))
         self.scale.copy_(torch.from_numpy(scale))
         self.weight.copy_(torch.from_numpy(weight))
         self.learnt.fill_(True)
@@ -164,16 +168,27 @@ def _least_kurtosis(white: np.ndarray, generator: np.random.Generator) -> np.nda
 def _agreeing(differences: np.ndarray, sign: np.ndarray) -> np.ndarray:
     """Weights of discriminant analysis, repeated on its own answers until they stay."""
     for _ in range(_ROUNDS):
-        turned = sign[:, None] * differences
-        mean = turned.mean(axis=0)
-        spread = np.cov(turned.T) + _RIDGE * np.eye(len(mean))
-        # Two Gaussians at +-mean: the logarithm of the odds is twice the discriminant.
-        weight = 2 * np.linalg.solve(spread, mean)
+        weight = _discriminant(differences, sign)
         answer = np.sign(differences @ weight)
         if (answer == sign).all():
             break
         sign = answer
     return weight
+
+
+def _discriminant(differences: np.ndarray, sign: np.ndarray) -> np.ndarray:
+    """Weights [F] of discriminant analysis of differences [n, F] with these signs [n]."""
+    turned = sign[:, None] * differences
+    mean = turned.mean(axis=0)
+    spread = np.cov(turned.T) + _RIDGE * np.eye(len(mean))
+    # Two Gaussians at +-mean: the logarithm of the odds is twice the discriminant.
+    return 2 * np.linalg.solve(spread, mean)
+
+
+def _standardised(differences: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Differences [n, F] in units of their scale, capped, and that scale [F]."""
+    scale = np.sqrt((differences**2).mean(axis=0)) + 1e-9
+    return np.clip(differences / scale, -_CAP, _CAP), scale
 
 
 def _kurtosis(values: np.ndarray) -> float:

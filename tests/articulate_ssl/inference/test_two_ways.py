@@ -81,7 +81,7 @@ def test_log_odds_are_antisymmetric_and_say_how_sure(generator):
     values, sign = differences(1200, generator)
     one = torch.from_numpy(values)
     two_ways = TwoWays(1, 16)
-    assert two_ways.learn_decision(one, torch.zeros_like(one))
+    assert two_ways.learn_decision(*[(one, torch.zeros_like(one))] * 2)
     odds = two_ways.log_odds(one, torch.zeros_like(one))
     torch.testing.assert_close(two_ways.log_odds(torch.zeros_like(one), one), -odds)
     right = torch.from_numpy(sign).sign() == odds.sign()
@@ -95,8 +95,44 @@ def test_log_odds_are_antisymmetric_and_say_how_sure(generator):
 def test_too_few_clouds_decide_nothing(generator):
     values = torch.from_numpy(differences(60, generator)[0])
     two_ways = TwoWays(1, 16)
-    assert not two_ways.learn_decision(values, torch.zeros_like(values))
+    assert not two_ways.learn_decision(*[(values, torch.zeros_like(values))] * 2)
     assert not two_ways.learnt
+
+
+def test_what_noise_hides_weighs_less_than_what_it_leaves(generator):
+    """The finest difference is the clearest; with noise, nothing of it is left, but one that is less clear is."""
+
+    def clouds(count: int, noise: bool) -> tuple[torch.Tensor, torch.Tensor]:
+        values, sign = torch.randn(count, 16, generator=generator, dtype=torch.float64), torch.ones(count).double()
+        sign[torch.rand(count, generator=generator) < 0.5] = -1
+        values[:, 2] += sign * (0 if noise else 4)
+        values[:, 5] += sign * 1.5
+        return values, sign
+
+    def right(two_ways: TwoWays, noise: bool) -> float:
+        values, sign = clouds(4000, noise)
+        share = float((two_ways.log_odds(values, torch.zeros_like(values)).sign() == sign).double().mean())
+        return max(share, 1 - share)
+
+    clean, sign = clouds(1000, noise=False)
+    noisy = clean.clone()
+    noisy[:, 2] -= 4 * sign
+    none = torch.zeros_like(clean)
+    without, with_noise = TwoWays(1, 16), TwoWays(1, 16)
+    without.learn_decision((clean, none), (clean, none))
+    with_noise.learn_decision((clean, none), (noisy, none))
+    assert right(without, noise=False) > 0.99 and right(with_noise, noise=False) > 0.99
+    assert right(with_noise, noise=True) > right(without, noise=True) + 0.02
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_clouds_without_relief_teach_nothing(generator, which):
+    values = torch.from_numpy(differences(120, generator)[0])
+    reliefs = [(values, torch.zeros_like(values)) for _ in range(2)]
+    lost = values.clone()
+    lost[:30, 3] = torch.nan
+    reliefs[which] = lost, reliefs[which][1]
+    assert not TwoWays(1, 16).learn_decision(*reliefs)  # 90 are too few
 
 
 def test_weights_from_before_there_was_a_decision_load():

@@ -42,6 +42,23 @@ def test_an_object_with_one_explanation_gets_no_twin(module, clouds, monkeypatch
     assert not module.two_ways.learnt
 
 
+def test_the_decision_is_taught_with_noise_of_every_strength(module, clouds, monkeypatch):
+    seen = []
+
+    def relief(one, dense):
+        seen.append(dense)
+        return torch.zeros(len(dense), 2 * NUM_FEATURES)
+
+    monkeypatch.setattr(explanations, "FEWEST", 1)
+    monkeypatch.setattr(module.two_ways, "learn_twin", lambda *_: True)
+    monkeypatch.setattr(module.estimator, "_relief", relief)
+    learn_two_ways(module, clouds)
+    clean, twin, noisy, noisy_twin = seen
+    assert clean is twin and torch.equal(clean, clouds) and noisy is noisy_twin
+    strength = (noisy - clouds).flatten(1).std(dim=1)
+    assert strength.max() < 0.0105 and strength.max() > 2 * strength.min()
+
+
 @pytest.mark.parametrize("refine", [True, False])
 def test_without_dense_points_nothing_is_decided(module, clouds, refine):
     before = module.predict_points(clouds[:, :POINTS], refine)
