@@ -49,6 +49,7 @@ class InstanceFit:
         generator: Of the points drawn.
         axes: [K, 3, 3] columns along which parts stretch instead; joint axes then stay as they are.
         log_stretch: [n, K, 3] start; none by default.
+        beside: [n, K, 3] start of where parts lie beside their slide, with `axes`; none by default.
     """
 
     def __init__(
@@ -59,6 +60,7 @@ class InstanceFit:
         generator: torch.Generator,
         axes: Tensor | None = None,
         log_stretch: Tensor | None = None,
+        beside: Tensor | None = None,
     ) -> None:
         self._shape, self._base, self._generator = shape, base, generator
         self._axis, self._pivot, self._state = shape.joints.axis.clone(), shape.joints.pivot.clone(), state.clone()
@@ -66,6 +68,8 @@ class InstanceFit:
         self._stretch, self._beside = (base.new_zeros(len(base), shape.num_parts, 3) for _ in range(2))
         if log_stretch is not None:
             self._stretch += _BOUND * (log_stretch / _BOUND).clamp(-_START, _START).atanh()
+        if beside is not None:
+            self._beside += beside
         self.axes = axes
         self._axes = torch.eye(3).to(base).repeat(shape.num_parts, 1, 1) if axes is None else axes
         self._center = shape.points.mean(dim=0)
@@ -91,6 +95,11 @@ class InstanceFit:
     def log_stretch(self) -> Tensor:
         """[n, K, 3] of every part along its principal axes, within the bound."""
         return _BOUND * (self._stretch / _BOUND).tanh()
+
+    @property
+    def beside(self) -> Tensor | None:
+        """[n, K, 3] where parts lie beside their slide, in template space; None where none may."""
+        return None if self.axes is None else self._beside
 
     def rehinged(
         self,

@@ -33,6 +33,8 @@ class RegisteredShape:
         error: [n] distance of every cloud to its reconstruction, stretched to its proportions (`InstanceFit.error`).
         axes: [K, 3, 3] columns along which parts stretch, where these are not their principal axes: the axes of the
             frame that clouds have in common.
+        beside: [n, K, 3] how far parts of each cloud lie beside their slide, in canonical object space, where they may.
+        point_part: [n, N] which part every point of the clouds belongs to, where more than the shape says it.
     """
 
     shape: ArticulatedShape
@@ -41,22 +43,25 @@ class RegisteredShape:
     log_stretch: Tensor
     error: Tensor
     axes: Tensor | None = None
+    beside: Tensor | None = None
+    point_part: Tensor | None = None
 
     @staticmethod
     def of(fit: InstanceFit, clouds: Tensor) -> RegisteredShape:
         """What an instance fit says about its clouds [n, N, 3]."""
         error = fit.error(clouds, softened=False)
-        return RegisteredShape(fit.shape, fit.base, fit.state, fit.log_stretch, error, fit.axes)
+        return RegisteredShape(fit.shape, fit.base, fit.state, fit.log_stretch, error, fit.axes, fit.beside)
 
     def of_clouds(self, rows: Tensor | slice) -> RegisteredShape:
         """The same for some of the clouds."""
-        own = {name: getattr(self, name)[rows] for name in ("base", "state", "log_stretch", "error")}
-        return replace(self, **own)
+        own = {name: getattr(self, name) for name in ("base", "state", "log_stretch", "error", "beside", "point_part")}
+        return replace(self, **{name: value[rows] for name, value in own.items() if value is not None})
 
     def fit(self, generator: torch.Generator, rows: Tensor | slice = slice(None)) -> InstanceFit:
         """An instance fit to go on from here, on some of the clouds; stretches along principal axes start anew."""
-        start = None if self.axes is None else self.log_stretch[rows]
-        return InstanceFit(self.shape, self.base[rows], self.state[rows], generator, self.axes, start)
+        own = self.of_clouds(rows)
+        start = None if self.axes is None else own.log_stretch
+        return InstanceFit(self.shape, own.base, own.state, generator, self.axes, start, own.beside)
 
     def limits(self) -> Tensor:
         """[J, 2] between which joint states lie, as far as the clouds show."""
@@ -92,7 +97,9 @@ class RegisteredShape:
         """The same with the canonical space turned."""
         turn = se3(rotation, rotation.new_zeros(3))
         axes = None if self.axes is None else rotation @ self.axes
-        return replace(self, shape=self.shape.in_frame(turn), base=self.base @ invert_se3(turn), axes=axes)
+        beside = None if self.beside is None else self.beside @ rotation.mT
+        base = self.base @ invert_se3(turn)
+        return replace(self, shape=self.shape.in_frame(turn), base=base, axes=axes, beside=beside)
 
 
 def trimmed_mean(error: Tensor, count: int) -> float:

@@ -40,12 +40,16 @@ class Reshaping:
     Args:
         found: A shape registered to the clouds.
         clouds: [n, P, 3].
+
+    Attributes:
+        point_part: [n, P] which part every point belongs to: the nearest of the registered one's, in its proportions.
     """
 
     def __init__(self, found: RegisteredShape, clouds: Tensor) -> None:
-        fit = InstanceFit(found.shape, found.base, found.state, torch.Generator(), found.axes, found.log_stretch)
+        own = found.axes, found.log_stretch, found.beside
+        fit = InstanceFit(found.shape, found.base, found.state, torch.Generator(), *own)
         self._found, self._points, self._joints = found, clouds, fit.instances().joints
-        self._label = found.shape.label[nearest_index(clouds, fit.posed())]  # [n, P]
+        self.point_part = found.shape.label[nearest_index(clouds, fit.posed())]
         self._axes = object_axes(found.shape)
         normals = [Surface.of(cloud).normals for cloud in clouds.double().numpy()]
         self._normals = torch.from_numpy(np.stack(normals)).to(clouds)
@@ -78,9 +82,11 @@ class Reshaping:
         rest = PartMaps.of(invert_se3(joints.part_pose(base, self._found.state)))
         stretched = PartMaps(scale[:, None] @ rest.linear, rest.shift @ scale)
         maps = stretched.then(reshaped.part_pose(base, state))
-        normals = torch.einsum("npij,npj->npi", _by_point(torch.linalg.inv(maps.linear).mT, self._label), self._normals)
-        points = torch.einsum("npij,npj->npi", _by_point(maps.linear, self._label), self._points)
-        points = points + _by_point(maps.shift, self._label)
+        normals = torch.einsum(
+            "npij,npj->npi", _by_point(torch.linalg.inv(maps.linear).mT, self.point_part), self._normals
+        )
+        points = torch.einsum("npij,npj->npi", _by_point(maps.linear, self.point_part), self._points)
+        points = points + _by_point(maps.shift, self.point_part)
         return Reshaped(points, functional.normalize(normals, dim=-1), state)
 
 

@@ -49,7 +49,7 @@ def simulate_views(
     Raises:
         DiscoveryError: if no view shows so many points.
     """
-    points, bases, scales, states, sources = [], [], [], [], []
+    points, bases, scales, states, sources, parts = [], [], [], [], [], []
     reshaping, drawn = Reshaping(found, clouds), torch.Generator().manual_seed(int(generator.integers(2**31)))
     base = found.base.double().numpy()
     for rotation in rotations.double().numpy().swapaxes(0, 1):
@@ -64,6 +64,7 @@ def simulate_views(
             pose = turn @ base[i]
             pose[:3, 3] = view.scale * (pose[:3, 3] + view.shift)
             points.append(view.points[:num_points])
+            parts.append(reshaping.point_part[i][torch.from_numpy(view.seen[:num_points])])
             bases.append(pose)
             scales.append(view.scale)
             states.append(objects.state[i])
@@ -85,12 +86,15 @@ def simulate_views(
         state=state,
         log_stretch=stretch,
         error=found.error[sources] * scale,
+        beside=None if found.beside is None else mean * found.beside[sources],
+        point_part=torch.stack(parts),
     )
     return torch.from_numpy(np.stack(points)).to(clouds), registered
 
 
 class _View(NamedTuple):
     points: np.ndarray  # [M, 3] that are seen: scale * (point + shift)
+    seen: np.ndarray  # [M] which of the cloud's they are
     scale: float
     shift: np.ndarray  # [3]
 
@@ -105,7 +109,7 @@ def _view(surface: Surface, mean_distance: float, generator: np.random.Generator
     pixels = np.abs((normals * points).sum(axis=1)) / distance**3  # of a patch of surface: its solid angle
     center = np.average(points, axis=0, weights=pixels)
     scale = mean_distance / np.average(np.linalg.norm(points - center, axis=1), weights=pixels)
-    return _View(scale * (points - center), float(scale), shift - center)
+    return _View(scale * (points - center), seen, float(scale), shift - center)
 
 
 def in_front(

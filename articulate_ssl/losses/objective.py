@@ -88,6 +88,7 @@ class PoseTarget(NamedTuple):
 
     base: Tensor  # [B, 4, 4]
     state: Tensor  # [B, J]
+    point_part: Tensor | None = None  # [B, N] of the points, where it is known
 
 
 def rigid_loss(
@@ -169,6 +170,8 @@ def staged_terms(
             explained = distances_to_parts(points, _posed_category(at_target, category) if follow_category else goal)
         distillation = (posed - goal).norm(dim=-1).mean()
     association = posterior_association(explained, options.posterior_scale)
+    if target is not None and target.point_part is not None:
+        association = functional.one_hot(target.point_part, posed.shape[1]).to(association)
     labels = association.argmax(dim=-1)
     to_cloud = None if options.unidirectional else distances_to_cloud(posed, points, labels)
     reconstruction = part_by_part(to_part, to_cloud, association).mean()

@@ -45,6 +45,7 @@ class HandOver:
         state: [n, J] joint states.
         log_stretch: [n, K, 3] of every part along its principal axes.
         limits: [J, 2] between which joint states lie.
+        point_part: [n, N] which part every point belongs to, where discovery says it: of simulated views.
     """
 
     points: Tensor
@@ -52,6 +53,7 @@ class HandOver:
     state: Tensor
     log_stretch: Tensor
     limits: Tensor
+    point_part: Tensor | None = None
 
 
 class TrainingRecipe(Recipe):
@@ -96,7 +98,12 @@ class TrainingRecipe(Recipe):
         kept = slice(None) if self._simulated else found.error.argsort()[: self.discovery.kept(len(clouds))]
         registered = found.of_clouds(kept)
         self.found = HandOver(
-            clouds[kept, :num_points], registered.base, registered.state, registered.log_stretch, found.limits()
+            clouds[kept, :num_points],
+            registered.base,
+            registered.state,
+            registered.log_stretch,
+            found.limits(),
+            registered.point_part,
         )
         network.category.adopt(found.shape)
         if found.axes is not None and not self._simulated:  # in a frame that the clouds share
@@ -176,7 +183,8 @@ class TrainingRecipe(Recipe):
             rotation = rotation @ base[:, :3, :3].mT  # to an orientation within the range
         turn = se3(rotation, rotation.new_zeros(size, 3))
         aligned, pose = self.estimator.align(transform_points(turn, points))
-        return aligned, PoseTarget(invert_se3(pose) @ turn @ base, state)
+        part = None if self.found.point_part is None else self.found.point_part[index].to(device)
+        return aligned, PoseTarget(invert_se3(pose) @ turn @ base, state, part)
 
     def _self_supervised_step(self, points: Tensor) -> Outcome:
         """The best reconstruction of any cloud trains, drawn to where a few rounds of registration move it."""

@@ -91,3 +91,16 @@ def test_draws_are_repeatable_and_within_what_the_clouds_show():
     assert (first.state >= low).all() and (first.state <= high).all()
     size = [cloud.amax(dim=1) - cloud.amin(dim=1) for cloud in (first.points, points)]
     assert (size[0] / size[1]).log().abs().amax() < 1  # nothing flies apart
+
+
+def test_points_of_what_lies_beside_its_slide_are_told_by_where_it_lies():
+    """A drawer as high as its body, but for a fifth of the chest's size farther up than the template's."""
+    points, found = _registered(DRAWER)
+    beside = torch.zeros(COUNT, 2, 3)
+    beside[:, 1, 2] = 0.2
+    moved = replace(found.shape, points=found.shape.points + beside[0, found.shape.label])
+    found = replace(found, axes=torch.eye(3).repeat(2, 1, 1), beside=beside)
+    points = moved.posed(found.base, found.state)
+    part = Reshaping(found, points).point_part
+    assert (part == moved.label).all()
+    assert (Reshaping(replace(found, beside=None), points).point_part == moved.label).double().mean() < 0.98

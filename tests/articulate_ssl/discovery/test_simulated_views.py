@@ -8,6 +8,7 @@ import roma
 import torch
 from articulated_objects import DRAWER, LAPTOP, clouds, true_shape
 
+from articulate_ssl.discovery import reshaping
 from articulate_ssl.discovery.discover import DiscoveryError
 from articulate_ssl.discovery.registered_shape import RegisteredShape
 from articulate_ssl.discovery.registrar import state_starts
@@ -56,6 +57,23 @@ def test_views_are_normalised_and_the_far_side_is_hidden():
     far = (posed[..., 2].amax(dim=1) - seen[..., 2].amax(dim=1)).mean()
     near = (seen[..., 2].amin(dim=1) - posed[..., 2].amin(dim=1)).mean()
     assert far > near  # the camera looks along z
+
+
+@pytest.mark.parametrize("reshape", [False, True])
+@pytest.mark.parametrize("design", [LAPTOP, DRAWER], ids=["laptop", "drawer"])
+def test_the_part_of_every_point_is_known(design, reshape, monkeypatch):
+    monkeypatch.setattr(reshaping, "_SPREAD", 0.0)  # of the very object, in other states
+    points, found = _registered(design)
+    turns = OrientationRange(60).draw(6, torch.Generator().manual_seed(0))[:, None]
+    seen, registered = simulate_views(found, points, turns, POINTS, 0.3, np.random.default_rng(0), reshape=reshape)
+    larger = registered.log_stretch[:, 0, 0].exp()
+    for i, view in enumerate(seen):
+        shape = registered.shape.scaled(float(larger[i]))
+        posed = shape.posed(registered.base[i, None], registered.state[i, None])[0]
+        distance = torch.stack([torch.cdist(view, posed[shape.label == k]).amin(dim=1) for k in range(2)], dim=1)
+        assert distance.gather(1, registered.point_part[i, :, None]).max() < 1e-3
+        assert (distance.argmin(dim=1) == registered.point_part[i]).double().mean() > 0.95  # they touch
+    assert registered.point_part.unique().tolist() == [0, 1]
 
 
 def test_views_of_too_few_points_are_left_out():

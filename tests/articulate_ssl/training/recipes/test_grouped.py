@@ -7,6 +7,7 @@ import pytest
 import torch
 from synthetic import write_synthetic_set
 from tiny import DISCOVERY, POINTS, fit, quiet_trainer, tiny_data, tiny_module
+from torch.nn import functional
 from unlabelled import without_labels
 
 from articulate_ssl.discovery.registered_shape import RegisteredShape
@@ -117,8 +118,9 @@ def test_views_are_taught_by_scans_of_the_category(tmp_path, monkeypatch):
     def from_scans(views, clouds, objects, instance, *rest):
         given["all"] = views, clouds, objects, instance
         given["rest"] = rest
-        return clouds[:4, :POINTS], _some_shape(clouds[:4])
+        return clouds[:4, :POINTS], replace(_some_shape(clouds[:4]), point_part=parts)
 
+    parts = torch.randint(2, (4, POINTS), generator=torch.Generator().manual_seed(0))
     monkeypatch.setattr(staged, "discover_from_scans", from_scans)
     module = tiny_module(discovery=GROUPED, objective=VIEWS, orientation_range=100.0)
     fit(module, tmp_path / "views", 1, view="partial", protocol="honest", scans=str(scans))
@@ -130,6 +132,14 @@ def test_views_are_taught_by_scans_of_the_category(tmp_path, monkeypatch):
     points, target = module.recipe._registered_clouds(5, torch.Generator().manual_seed(0), torch.device("cpu"))
     assert all((one == module.recipe.found.points).all(dim=(1, 2)).any() for one in points)
     assert torch.equal(target.base[:, :3, :3], torch.eye(3).expand(5, 3, 3))
+    # Whose part is known counts for it, whatever lies nearer; the checkpoint keeps it.
+    which = (points[:, None] == module.recipe.found.points).all(dim=(2, 3)).int().argmax(dim=1)
+    assert torch.equal(target.point_part, parts[which])
+    outcome = module.recipe._warmup_step(points, torch.Generator().manual_seed(0))
+    assert torch.equal(outcome.terms.association, functional.one_hot(parts[which], 2).float())
+    again = tiny_module(discovery=GROUPED, objective=VIEWS, orientation_range=100.0)
+    again.recipe.restore(module.recipe.kept())
+    assert torch.equal(again.recipe.found.point_part, parts)
 
 
 def test_scans_of_another_category_or_view_are_refused(tmp_path):
