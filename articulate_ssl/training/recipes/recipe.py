@@ -121,10 +121,10 @@ class Recipe(ABC):
         """The same for category-level shapes and joints."""
         return self.network_rate(step)
 
-    def kept(self) -> dict[str, Tensor] | None:
+    def kept(self) -> dict[str, Tensor | None] | None:
         """What a checkpoint must keep for training to resume."""
         return None
 
-    def restore(self, kept: dict[str, Tensor] | None) -> None:
+    def restore(self, kept: dict[str, Tensor | None] | None) -> None:
         """Take it back."""
         return

@@ -136,11 +136,11 @@ class TrainingRecipe(Recipe):
         """Shapes and joints are held during the warm-up."""
         return 0.0 if step < self._warm else self.schedule.category_rate * self.network_rate(step)
 
-    def kept(self) -> dict[str, Tensor] | None:
+    def kept(self) -> dict[str, Tensor | None] | None:
         """The registered clouds, so that training resumes without discovery."""
         return None if self.found is None else asdict(self.found)
 
-    def restore(self, kept: dict[str, Tensor] | None) -> None:
+    def restore(self, kept: dict[str, Tensor | None] | None) -> None:
         """Take them back."""
         self.found = None if kept is None else HandOver(**kept)
 
