@@ -77,7 +77,7 @@ def test_the_multi_state_setting_is_on_the_card(run, tmp_path):
     with pytest.raises(CheckpointError, match=r"model\.discovery\.grouped is None, not True"):
         pack(file, folder=tmp_path / "weights")
     config = yaml.safe_load(file.with_name("config.yaml").read_text())
-    config["model"]["discovery"] = {"grouped": True}
+    config["model"] |= yaml.safe_load((ROOT / "configs/profiles/multi_state.yaml").read_text())["model"]
     file.with_name("config.yaml").write_text(yaml.safe_dump(config))
     card = WeightsCard.load(pack(file, folder=tmp_path / "weights").file.with_suffix(".json"))
     assert card.setting == "multi-state" and "-c configs/profiles/multi_state.yaml" in card.training["command"]
