@@ -66,7 +66,7 @@ def _figures(args: argparse.Namespace) -> list[Path]:
         features = part_features.measure(module, next(iter(few.test_dataloader())))
     joint_type = module.articulated.joint_type
     return [
-        *noise_curve.write(noise, f"{of}: {args.samples} test clouds with noise", folder),
+        *noise_curve.write(noise, f"{of}: {noise[True][0]['samples']} test clouds with noise", folder),
         *part_features.write(features, joint_type, f"{of}: do features of one part stay while another moves?", folder),
     ]
 

@@ -33,8 +33,6 @@ _STATISTICS = ("mean", "median", "low", "high")
 
 log = logging.getLogger(__name__)
 
-Batches = list[dict[str, Tensor]]
-
 
 def measure(
     module: ArticulatedPoseModule,
