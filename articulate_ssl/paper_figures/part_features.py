@@ -22,7 +22,7 @@ from torch import Tensor
 
 from articulate_ssl.geometry.screw import REVOLUTE, screw_motion
 from articulate_ssl.geometry.se3 import transform_points
-from articulate_ssl.inference.pictures.viewpoint import viewing_rotation
+from articulate_ssl.inference.pictures.viewpoint import three_quarter_view
 from articulate_ssl.losses.reconstruction import distances_to_parts
 from articulate_ssl.network.articulated_network import in_part_frames
 from articulate_ssl.training.module import ArticulatedPoseModule
@@ -31,7 +31,6 @@ from datamodules.atomic import atomic_write
 NAMES = ("first iteration: of the whole cloud", "second iteration: part-level")
 STEPS = 7  # states of the moving part, from the lowest to the highest in training
 DRAWN = (0, 2, 4, 6)  # of them, in the picture
-_SHOWN = 2048  # points of the first cloud in the picture, each coloured as the nearest that has features
 _GREY = 0.85
 
 
@@ -44,7 +43,8 @@ class PartFeatures:
         features: Of either kind [B, S, C, D].
         states: [B, S] of the joint.
         shown: [S, M, 3] the first cloud in every state, x right, y up, z towards the viewer.
-        nearest: [M] of its C points with features the nearest of the same part; -1 for points that do not stay.
+        nearest: [M] of its C points with features the nearest of the same part, whose colour they get in the picture;
+            -1 for points that do not stay.
     """
 
     stays: Tensor
@@ -91,8 +91,8 @@ def measure(
     states = states.expand(len(state), STEPS)
     axis, pivot = (batch[name][:, 0, None].expand(-1, STEPS, -1) for name in ("joint_axis", "joint_pivot"))
     motion = screw_motion(axis, pivot, states - state[:, None], kind)  # [B, S, 4, 4]
-    part = batch["dense_part_id"][:, :_SHOWN]
-    points = batch["dense_points"][:, None, :_SHOWN].expand(-1, STEPS, -1, -1)
+    part = batch["dense_part_id"]
+    points = batch["dense_points"][:, None].expand(-1, STEPS, -1, -1)
     moved = torch.where((part == child)[:, None, :, None], transform_points(motion, points), points)
     # The second kind reads every cloud in the frames that the first estimate gave it, as in training and at test time.
     clouds = moved[:, :, :count].flatten(0, 1)
@@ -103,9 +103,7 @@ def measure(
     kinds = (network.point_features(aligned), network.point_features(in_part_frames(aligned, estimate, labels)))
     features = tuple(own.unflatten(0, (-1, STEPS)) for own in kinds)
     stays = part == parent
-    seen = module.predict_points(moved[:1, STEPS // 2, :count])
-    view = viewing_rotation(seen, module.state_range, module.orientation.limited)
-    view = torch.from_numpy(view).to(moved) @ seen.base_pose[0, :3, :3].mT
+    view = torch.from_numpy(three_quarter_view()).to(moved) @ batch["object_rotation"][0].mT
     deep = features[0].shape[2]
     distance = torch.cdist(points[0, 0], points[0, 0, :deep]).masked_fill(~stays[0, :deep], torch.inf)
     nearest = distance.argmin(dim=1).masked_fill(~stays[0], -1)
@@ -154,7 +152,7 @@ def _drawn(found: PartFeatures, motion: Tensor, changes: list[Tensor], turns: bo
 
 def _scatter(axes: Axes, points: np.ndarray, colours: np.ndarray) -> None:
     order = points[:, 2].argsort()
-    axes.scatter(*points[order, :2].T, c=colours[order], s=6, linewidths=0)
+    axes.scatter(*points[order, :2].T, c=colours[order], s=4, linewidths=0)
     axes.set_aspect("equal")
     axes.set_axis_off()
 

@@ -25,10 +25,15 @@ def viewing_rotation(
     upright: bool = False,
 ) -> np.ndarray:  # [3, 3] canonical object space -> (right, up, towards the viewer)
     """A three-quarter view of the object that `level_frame` stands on its feet."""
+    return three_quarter_view() @ level_frame(prediction, state_range, upright)
+
+
+def three_quarter_view() -> np.ndarray:  # [3, 3] (right, up, front) -> (right, up, towards the viewer)
+    """Of an object that stands on its feet, its front to the viewer."""
     c, s = np.cos(AZIMUTH), np.sin(AZIMUTH)
     turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
     c, s = np.cos(ELEVATION), np.sin(ELEVATION)
-    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ turn @ level_frame(prediction, state_range, upright)
+    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ turn
 
 
 def level_frame(
