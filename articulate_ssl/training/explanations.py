@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _BATCH = 16
 # Standard deviation of the noise, at most: a hundredth of the object's diagonal, that of a scanner of small things.
-# Of 60 unseen laptops' clouds with noise of .02, 16.7 % were turned over without it, 14.2 % with it (step 86 of the log).
+# Of unseen laptops' clouds with noise of .02, 16.7 % were turned over without it, 14.2 % with it (step 86 of the log).
 _NOISE = 0.01
 _RELATED = 208  # clouds that show whether, and how, two explanations are related: that takes fewer than the decision
 
