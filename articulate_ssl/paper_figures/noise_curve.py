@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from torch import Tensor
 
-from articulate_ssl.inference.prediction import Prediction, concatenate
+from articulate_ssl.inference.prediction import concatenate
 from articulate_ssl.metrics.articulated_pose import ArticulatedPoseMetrics
 from articulate_ssl.metrics.calibration import calibrate
 from articulate_ssl.ops.progress import announced
@@ -48,20 +47,21 @@ def measure(
     """
     clean = ArticulatedDataModule(**data_options, test_noise_std=0.0)
     clean.setup("test")
-    known = [_as_test_sees(module, batch) for batch in clean.calibration_dataloader(calibration_samples)]
+    known = [module.whole(batch) for batch in clean.calibration_dataloader(calibration_samples)]
     labels = {name: torch.cat([batch[name] for batch in known]) for name in known[0]}
     calibrations = {
-        refine: calibrate(concatenate([_predict(module, batch, refine) for batch in known]), labels) for refine in WAYS
+        refine: calibrate(concatenate([module.predict_batch(batch, refine) for batch in known]), labels)
+        for refine in WAYS
     }
     found: dict[bool, list[dict]] = {refine: [] for refine in WAYS}
     for sigma in SIGMAS:
         noisy = ArticulatedDataModule(**data_options, test_noise_std=sigma)
         noisy.setup("test")
-        batches = [_as_test_sees(module, batch) for batch in noisy.test_dataloader()]
+        batches = [module.whole(batch) for batch in noisy.test_dataloader()]
         metrics = {refine: ArticulatedPoseMetrics(calibration) for refine, calibration in calibrations.items()}
         for batch in announced(log, f"noise of {sigma:g}", batches):
             for refine, own in metrics.items():
-                own.update(_predict(module, batch, refine), batch)
+                own.update(module.predict_batch(batch, refine), batch)
         for refine, own in metrics.items():
             found[refine].append(own.compute())
     return found
@@ -105,13 +105,3 @@ def _drawn(found: dict[bool, list[dict]], title: str) -> Figure:
     figure.axes[0].legend(frameon=False)
     figure.suptitle(title)
     return figure
-
-
-def _as_test_sees(module: ArticulatedPoseModule, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The batch with as many points as registration reads, as in `lightning test`."""
-    count = max(module.num_points, module.inference.points)
-    return batch | {"points": batch["dense_points"][:, :count]}
-
-
-def _predict(module: ArticulatedPoseModule, batch: dict[str, Tensor], refine: bool) -> Prediction:
-    return module.predict_points(batch["points"], refine, batch["dense_points"])

@@ -317,18 +317,18 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             self.test_report = LabelFreeReport(self.predict_points, self.orientation.limited).to(self.device)
             return
         loader = self.trainer.datamodule.calibration_dataloader(self.calibration_samples)
-        batches = [self._whole(self.transfer_batch_to_device(batch, self.device, 0)) for batch in loader]
+        batches = [self.whole(self.transfer_batch_to_device(batch, self.device, 0)) for batch in loader]
         shown = announced(log, "calibration on training clouds", batches)
-        predictions = [self._predict(batch) for batch in shown]
+        predictions = [self.predict_batch(batch) for batch in shown]
         self.test_report = TestReport(predictions, batches, self.orientation.limited).to(self.device)
         if self.inference.columns:
-            self.test_columns = TestColumns(self._predict, self._search, self.inference.refine, batches)
+            self.test_columns = TestColumns(self.predict_batch, self._search, self.inference.refine, batches)
 
     def test_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
         """Predict, then compare."""
-        batch = self._whole(batch)
+        batch = self.whole(batch)
         start = time.perf_counter()
-        prediction = self._predict(batch)
+        prediction = self.predict_batch(batch)
         seconds = time.perf_counter() - start
         known = self.confidence.learnt
         probability = self.confidence_of(prediction, batch["points"])[0] if known else None
@@ -336,7 +336,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         if self.test_columns is not None:
             self.test_columns.update(batch)
 
-    def _predict(self, batch: dict[str, Tensor], refine: bool | None = None) -> Prediction:
+    def predict_batch(self, batch: dict[str, Tensor], refine: bool | None = None) -> Prediction:
+        """Predictions of a batch of the data module that is `whole`; no label is read."""
         inputs = split_labels(batch)[0]
         return self.predict_points(inputs["points"], refine, inputs["dense_points"])
 
@@ -344,7 +345,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         inputs = split_labels(batch)[0]
         return self.estimator.search(inputs["points"], self.state_range, inputs["dense_points"])
 
-    def _whole(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+    def whole(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """The batch with as many points as registration reads; the networks still see those that they would."""
         count = max(batch["points"].shape[1], self.inference.points)
         return batch | {"points": batch["dense_points"][:, :count]}

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 from lightning.pytorch import Trainer
+from synthetic import write_synthetic_set
 
 from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.network.options import NetworkOptions
@@ -80,3 +81,11 @@ def fit(module: ArticulatedPoseModule, root: Path, steps: int, checkpoint: Path 
         warnings.simplefilter("ignore")
         trainer.fit(module, tiny_data(root, **options), ckpt_path=checkpoint)
     return trainer
+
+
+def warmed_up(root: Path) -> ArticulatedPoseModule:
+    """A module after its warm-up on a synthetic set, which is written under `root`."""
+    write_synthetic_set(root)
+    module = tiny_module()
+    fit(module, root, 3)
+    return module

@@ -6,8 +6,7 @@ import warnings
 
 import pytest
 import torch
-from synthetic import write_synthetic_set
-from tiny import fit, quiet_trainer, tiny_data, tiny_module
+from tiny import quiet_trainer, tiny_data, tiny_module, warmed_up
 
 from articulate_ssl.paper_figures import noise_curve, part_features
 from articulate_ssl.paper_figures.__main__ import main
@@ -19,10 +18,7 @@ from datamodules.articulated_data_module import ArticulatedDataModule
 def trained(tmp_path_factory):
     """A set, and a module after its warm-up."""
     root = tmp_path_factory.mktemp("data")
-    write_synthetic_set(root)
-    module = tiny_module()
-    fit(module, root, 3)
-    return root, module.eval()
+    return root, warmed_up(root).eval()
 
 
 def options(root, module) -> dict:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from synthetic import write_synthetic_set
-from tiny import fit, quiet_trainer, tiny_data, tiny_module
+from tiny import quiet_trainer, tiny_data, tiny_module, warmed_up
 from unlabelled import without_labels
 
 from articulate_ssl.inference.pose_estimation import InferenceOptions
@@ -19,9 +19,7 @@ from articulate_ssl.training.columns import NETWORK, NO_NETWORK, REGISTERED
 def trained(tmp_path_factory):
     """A set, and a module after its warm-up."""
     root = tmp_path_factory.mktemp("data")
-    write_synthetic_set(root)
-    module = tiny_module()
-    fit(module, root, 3)
+    module = warmed_up(root)
     return root, module.state_dict(), module.recipe.kept()
 
 
