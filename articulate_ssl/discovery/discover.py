@@ -7,7 +7,7 @@
    piece to every aligned cloud on its own; `joint_fit` reduces the motion between them to joints; from there labels,
    joints and each cloud's proportions descend together (`instance_fit`), the better ones for longer (`selection`). The
    winner reconstructs best with joints and proportions, which is what a wrong split cannot do. So far every typical
-   cloud is on its own; the one whose shape explains all clouds best stays.
+   cloud is on its own; the one stays whose shape explains all clouds best, and by its joints (`joint_gain`).
 3. *Rounds*: register the articulated shape to every cloud again (`registrar`; from many orientations, which is what
    rights clouds that the rigid template fitted upside down), then descend again on the clouds that fit.
 
@@ -26,6 +26,7 @@ from articulate_ssl.discovery.bodies import fit_bodies
 from articulate_ssl.discovery.collection import Collection
 from articulate_ssl.discovery.instance_fit import InstanceFit
 from articulate_ssl.discovery.joint_fit import fit_joints
+from articulate_ssl.discovery.joint_gain import best_by_joints
 from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.discovery.proposals import Scene, load_proposals
 from articulate_ssl.discovery.references import aligned_to, alike, choose_references
@@ -74,20 +75,19 @@ def discover(
 
 
 def _best_reference(scenes: Iterator[Scene], few: Tensor, registrar: Registrar, num_parts: int) -> RegisteredShape:
-    """Of the typical clouds, split and jointed, the one that explains `few` clouds best."""
+    """Of the typical clouds, split and jointed, the one that explains `few` clouds best, and by its joints."""
     options, candidates = registrar.options, []
     for number, scene in enumerate(scenes, start=1):
         found = split(scene)
         if found is not None:
             _announce(2 * number - 1, options, f"template {number} of {options.references}, registration")
             candidates.append(registrar.register(found, few))
-            log.info("template of %d: error %.4f", len(candidates), _error(candidates[-1], options))
     if not candidates:
         raise DiscoveryError(
             f"part discovery found no part that moves in any split of {options.references} clouds: they do not show "
             f"{num_parts} parts that move on their own; check the category's number of parts, or allow more starts"
         )
-    return min(candidates, key=lambda candidate: _error(candidate, options))
+    return best_by_joints(candidates, few, options, registrar.generator)
 
 
 def split(scene: Scene) -> RegisteredShape | None:

@@ -17,7 +17,7 @@ class DiscoveryOptions:
         search_clouds: Those on which labels and joints are solved again; all are registered in the end.
         points: Points per cloud and template in registration.
         dense_points: The same where it is decided between registrations.
-        references: Typical clouds that are tried as the template.
+        references: Typical clouds, or `grouped` objects, that are tried as the template: every second may be split wrongly.
         proposals: What proposes splits, in this order: modules of `discovery.proposals`, or with dots in their names
             modules from anywhere.
         starts: Random splits of each reference.
@@ -38,7 +38,7 @@ class DiscoveryOptions:
     search_clouds: int = 64
     points: int = 256
     dense_points: int = 1024
-    references: int = 3
+    references: int = 6
     proposals: list[str] = field(default_factory=lambda: list(PROPOSALS))
     starts: int = 12
     jointed: int = 4
