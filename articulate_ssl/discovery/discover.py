@@ -87,7 +87,7 @@ def _best_reference(scenes: Iterator[Scene], few: Tensor, registrar: Registrar, 
             f"part discovery found no part that moves in any split of {options.references} clouds: they do not show "
             f"{num_parts} parts that move on their own; check the category's number of parts, or allow more starts"
         )
-    return best_by_joints(candidates, few, options, registrar.generator)
+    return best_by_joints(candidates, few, options)
 
 
 def split(scene: Scene) -> RegisteredShape | None:

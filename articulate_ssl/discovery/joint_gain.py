@@ -13,7 +13,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from articulate_ssl.discovery.instance_fit import InstanceFit
 from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.discovery.registered_shape import RegisteredShape, trimmed_mean
 
@@ -24,7 +23,6 @@ def best_by_joints(
     candidates: list[RegisteredShape],
     clouds: Tensor,  # [n, N, 3] that they are all registered to
     options: DiscoveryOptions,
-    generator: torch.Generator,
 ) -> RegisteredShape:
     """The one of the smallest error, of which what its joints explain is taken off once more."""
     if len(candidates) == 1:
@@ -32,7 +30,7 @@ def best_by_joints(
     scores = []
     for number, found in enumerate(candidates, start=1):
         error = trimmed_mean(found.error, options.kept(len(clouds)))
-        gain = joint_gain(found, clouds, options, generator)
+        gain = joint_gain(found, clouds, options)
         log.info("template %d of %d: error %.4f, joints explain %.4f", number, len(candidates), error, gain)
         scores.append(error - gain)
     return candidates[scores.index(min(scores))]
@@ -42,27 +40,26 @@ def joint_gain(
     found: RegisteredShape,
     clouds: Tensor,  # [n, N, 3] that it is registered to
     options: DiscoveryOptions,
-    generator: torch.Generator,
 ) -> float:
     """By how much the reconstruction error grows when a joint stands still, of the joint that matters least.
 
-    Pose, stretch and the other joints descend again from where they are, for as long as they do with all joints free.
-    The clouds that are reconstructed worst do not count: where the pose is wrong, a joint says nothing.
+    Pose, stretch and the other joints descend again from where they are, on the same points as they do with all joints
+    free. The clouds that are reconstructed worst do not count: where the pose is wrong, a joint says nothing.
     """
     best = found.error.argsort()[: options.kept(len(clouds))]
     found, clouds = found.of_clouds(best), clouds[best]
-    free = _error(found.fit(generator), clouds, options.cycles)
+    free = _error(found, clouds, options)
     still = []
     for joint, middle in enumerate(found.state.median(dim=0).values):
         state = found.state.clone()
         state[:, joint] = middle
         limits = torch.stack([state.amin(dim=0), state.amax(dim=0)], dim=-1)
         shape = replace(found.shape, joints=replace(found.shape.joints, limits=limits))
-        resting = replace(found, shape=shape, state=state)
-        still.append(_error(resting.fit(generator), clouds, options.cycles))
+        still.append(_error(replace(found, shape=shape, state=state), clouds, options))
     return min(still) - free
 
 
-def _error(fit: InstanceFit, clouds: Tensor, cycles: int) -> float:
-    fit.optimise(clouds, cycles, shared=False)
+def _error(found: RegisteredShape, clouds: Tensor, options: DiscoveryOptions) -> float:
+    fit = found.fit(torch.Generator().manual_seed(options.seed))
+    fit.optimise(clouds, options.cycles, shared=False)
     return float(fit.error(clouds, softened=False).mean())

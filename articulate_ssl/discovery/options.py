@@ -17,7 +17,8 @@ class DiscoveryOptions:
         search_clouds: Those on which labels and joints are solved again; all are registered in the end.
         points: Points per cloud and template in registration.
         dense_points: The same where it is decided between registrations.
-        references: Typical clouds, or `grouped` objects, that are tried as the template: every second may be split wrongly.
+        references: Typical clouds, or `grouped` objects, that are tried as the template. Every second one may be split
+            wrongly.
         proposals: What proposes splits, in this order: modules of `discovery.proposals`, or with dots in their names
             modules from anywhere.
         starts: Random splits of each reference.
