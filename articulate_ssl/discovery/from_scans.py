@@ -17,15 +17,13 @@ from torch import Tensor
 from articulate_ssl.discovery.grouped import discover_grouped
 from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.discovery.registered_shape import RegisteredShape
-from articulate_ssl.discovery.registrar import state_starts
 from articulate_ssl.discovery.simulated_views import simulate_views
 from articulate_ssl.discovery.view_orientations import find_view_orientations
 from articulate_ssl.geometry.orientation_range import OrientationRange
-from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.ops.denormals import flush_denormals
 from articulate_ssl.ops.progress import Stage, announce
 
-_PROBES = 48  # views in which the mean orientation is looked for: within 6 and 13 degrees on lamps and washing machines
+_SIDES = 20  # from which every cloud is seen, to find how objects are turned in the views
 _VIEWS = 30  # that are simulated of every scan, each of an object with other proportions and joint states
 
 log = logging.getLogger(__name__)
@@ -59,10 +57,9 @@ def discover_from_scans(
     turns = OrientationRange().draw(len(clouds) * _VIEWS, generator)
     if orientation.limited:
         _announce(0, "how objects are turned")
-        _, rough = simulate_views(found, clouds, turns[: len(clouds), None], num_points, mean_distance, random)
-        rotations = rotation_group(60).elements.to(views)
-        shape, states = rough.limited(), state_starts(rough.state)
-        stand = find_view_orientations(shape, states, views[:_PROBES], rotations)
+        sides = turns[: len(clouds) * _SIDES].unflatten(0, (-1, _SIDES))
+        seen, shown = simulate_views(found, clouds, sides, num_points, mean_distance, random)
+        stand = find_view_orientations(views, seen, shown.base[:, :3, :3])
         found, turns = found.turned(stand.mean), stand.draw(len(turns), orientation, generator)
     _announce(1, "views of the scans")
     turns = turns.unflatten(0, (-1, _VIEWS))

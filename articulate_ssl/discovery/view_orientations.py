@@ -1,32 +1,31 @@
 """How the objects of depth views are turned, relative to a shape that was found in complete clouds.
 
-Complete clouds stand in any orientation: nothing in them says how a camera was held. The views do: the shape is
-registered to each on its own, from all sides, without a pull at what is hidden. Many views end upside down or back to
-front, but in many different ways, while those that are right agree to within the range of views. Their mean is how
-objects stand, and their spread about it how views differ: more to the sides than in roll, as cameras are held.
+Complete clouds stand in any orientation: nothing in them says how a camera was held. The views do: each is compared
+with simulated views of many objects from all sides. Most of those that are like it are turned otherwise, a chest of
+drawers from behind like one from the front; but otherwise in many ways, while those that are right agree to within the
+range of views. Their mean is how objects stand, and their spread about it how views differ: more to the sides than in
+roll, as cameras are held.
+
+To register one shape to the views instead is no good where objects differ: a chest that stands on its side fits a wide
+view better than a tall chest does that stands as it should (docs/experiments.md, step 93).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numpy as np
 import roma
 import torch
 from torch import Tensor
 
-from articulate_ssl.discovery.registration import register_articulated
-from articulate_ssl.discovery.simulated_views import DISTANCE, in_front
+from articulate_ssl.discovery.registration import register_rigid
 from articulate_ssl.geometry.orientation_range import OrientationRange, mean_rotation
-from articulate_ssl.geometry.se3 import se3
-from articulate_ssl.ops.hidden_points import seen_from_origin
-from articulate_ssl.shape.articulated_shape import ArticulatedShape
+from articulate_ssl.ops.chamfer import nearest_distance
 
-_COARSE_POINTS, _FINE_POINTS = 128, 256
-_COARSE, _FINE = ((0.12, 0.05), 6), ((0.05, 0.03), 4)  # scales and rounds of registration
-_SURVIVORS = 30
+_POINTS = 128  # of each view
+_NEAREST = 30  # simulated views to which a view is registered
+_SCALES, _REGISTRATION_ROUNDS = (0.1, 0.04), 6
 _ALIKE = 60.0  # degrees: views of upright objects are seldom turned farther from their mean
 _ROUNDS = 4
 # Views that are drawn spread wider than those that were measured, of which the most turned are missing; and by at least
@@ -63,23 +62,19 @@ class ViewOrientations:
 
 
 def find_view_orientations(
-    shape: ArticulatedShape,  # as large as in the views
-    states: Tensor,  # [Q, J] to start from
     views: Tensor,  # [n, N, 3] depth views
-    rotations: Tensor,  # [H, 3, 3] to start from
+    simulated: Tensor,  # [s, M, 3] views of objects of the category from all sides
+    rotation: Tensor,  # [s, 3, 3] canonical object space -> camera in each
 ) -> ViewOrientations:
     """How objects stand before the camera in the mean, and how much views differ from that."""
-    start, state = rotations.repeat_interleave(len(states), dim=0), states.repeat(len(rotations), 1)
-    coarse, fine = shape.thinned(_COARSE_POINTS), shape.thinned(_FINE_POINTS)
-    offset = _seen_centers(shape.posed(se3(start, start.new_zeros(len(start), 3)), state))
-    found, errors = [], []
-    for view in views:
-        base = se3(start, view.mean(dim=0) - offset)
-        base, moved, error = _registered(coarse, view[:_COARSE_POINTS], base, state, *_COARSE)
-        best = error.topk(min(_SURVIVORS, len(error)), largest=False).indices
-        base, moved, _ = _registered(fine, view[:_FINE_POINTS], base[best], moved[best], *_FINE)
-        found.append(base[:, :3, :3])
-        errors.append(_seen_errors(shape.posed(base, moved), view))
+    sides, found, errors = simulated[:, :_POINTS].contiguous(), [], []
+    for view in views[:, :_POINTS]:
+        copies = view.expand(len(sides), -1, -1)
+        distance = nearest_distance(copies, sides).mean(dim=1) + nearest_distance(sides, copies).mean(dim=1)
+        nearest = distance.topk(min(_NEAREST, len(sides)), largest=False).indices
+        turn, error = register_rigid(view, sides[nearest], torch.eye(3).to(view)[None], 1, _SCALES, _REGISTRATION_ROUNDS)
+        found.append(turn[:, 0, :3, :3].mT @ rotation[nearest])
+        errors.append(error[:, 0])
     return _agreed(torch.stack(found), torch.stack(errors))
 
 
@@ -99,36 +94,6 @@ def _agreed(
         mean = mean_rotation(best[some])
     vector = roma.rotmat_to_rotvec(best[some] @ mean.mT)
     return ViewOrientations(mean, vector.mT @ vector / len(vector))
-
-
-def _registered(shape: ArticulatedShape, view: Tensor, base: Tensor, state: Tensor, scales, rounds: int):
-    copies = view.expand(len(base), -1, -1)
-    return register_articulated(shape, copies, base, state, scales, rounds, bidirectional=False)
-
-
-def _seen_errors(
-    posed: Tensor,  # [C, T, 3]
-    view: Tensor,  # [N, 3]
-) -> Tensor:  # [C]
-    """Distance of a view to shapes, and of what a camera sees of them to the view."""
-    distance = torch.cdist(view, posed)  # [C, N, T]
-    back = [near[seen].mean() for near, seen in zip(distance.amin(dim=1), _seen(posed), strict=True)]
-    return distance.amin(dim=2).mean(dim=1) + torch.stack(back)
-
-
-def _seen_centers(
-    posed: Tensor,  # [n, T, 3]
-) -> Tensor:  # [n, 3]
-    """The centres of what a camera sees of posed shapes."""
-    return torch.stack([points[seen].mean(dim=0) for points, seen in zip(posed, _seen(posed), strict=True)])
-
-
-def _seen(
-    posed: Tensor,  # [n, T, 3]
-) -> Iterator[Tensor]:  # [M] each
-    """Indices of the points of each shape that a camera sees that looks at its middle along z."""
-    for points in posed.double().numpy():
-        yield torch.from_numpy(seen_from_origin(points + in_front(points, float(np.mean(DISTANCE)))))
 
 
 def _degrees(a: Tensor, b: Tensor) -> Tensor:
