@@ -25,7 +25,7 @@ from articulate_ssl.ops.chamfer import nearest_distance
 
 _POINTS = 128  # of each view
 _NEAREST = 30  # simulated views to which a view is registered
-_SCALES, _REGISTRATION_ROUNDS = (0.1, 0.04), 6
+_SCALES, _STEPS = (0.1, 0.04), 6  # of that registration
 _ALIKE = 60.0  # degrees: views of upright objects are seldom turned farther from their mean
 _ROUNDS = 4
 # Views that are drawn spread wider than those that were measured, of which the most turned are missing; and by at least
@@ -72,7 +72,7 @@ def find_view_orientations(
         copies = view.expand(len(sides), -1, -1)
         distance = nearest_distance(copies, sides).mean(dim=1) + nearest_distance(sides, copies).mean(dim=1)
         nearest = distance.topk(min(_NEAREST, len(sides)), largest=False).indices
-        turn, error = register_rigid(view, sides[nearest], torch.eye(3).to(view)[None], 1, _SCALES, _REGISTRATION_ROUNDS)
+        turn, error = register_rigid(view, sides[nearest], torch.eye(3).to(view)[None], 1, _SCALES, _STEPS)
         found.append(turn[:, 0, :3, :3].mT @ rotation[nearest])
         errors.append(error[:, 0])
     return _agreed(torch.stack(found), torch.stack(errors))

@@ -40,6 +40,7 @@ MULTI_STATE = (
     ("safe", "depth"),
     ("washing_machine", "depth"),
     ("desk_lamp", "depth"),
+    ("drawer", "depth"),
 )
 MULTI_STATE_OPTIONS = ("--train-instances", "200", "--test-instances", "60", "--states", "10", "--rotations", "1")
 # Complete clouds of objects, which teach a network for depth views; views themselves only tell how objects are turned,
