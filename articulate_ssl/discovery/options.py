@@ -43,7 +43,7 @@ class DiscoveryOptions:
     proposals: list[str] = field(default_factory=lambda: list(PROPOSALS))
     starts: int = 12
     jointed: int = 4
-    rounds: int = 2
+    rounds: int = 4
     edge_hinges: bool = True
     cycles: int = 12
     keep: float = 0.75

@@ -77,16 +77,13 @@ class RegisteredShape:
         """The same with the canonical space turned as the clouds are in the mean."""
         return self.turned(mean_rotation(self.base[:, :3, :3]))
 
-    def with_parallel_axes(self) -> RegisteredShape:
-        """The same with one direction for all joints, that of the joint which the others agree with most.
-
-        What a part's shape leaves open, as about which line a lamp's round head turns, the other joints decide. States
-        follow as well as they can.
-        """
+    def with_parallel_axes(
+        self,
+        direction: Tensor,  # [3]
+    ) -> RegisteredShape:
+        """The same with all joints along one direction, each in its own sense; states follow as well as they can."""
         joints = self.shape.joints
-        cosine = joints.axis @ joints.axis.mT
-        likeliest = cosine.abs().sum(dim=1).argmax()
-        axis = cosine[likeliest].sign()[:, None] * joints.axis[likeliest]
+        axis = (joints.axis @ direction).sign()[:, None] * direction
         shape = replace(self.shape, joints=replace(joints, axis=axis))
         return replace(self, shape=shape, state=shape.read_states(joints.part_pose(self.base, self.state)))
 

@@ -20,6 +20,7 @@ from torch import Tensor
 from articulate_ssl.discovery.discover import discover
 from articulate_ssl.discovery.from_scans import discover_from_scans
 from articulate_ssl.discovery.grouped import discover_grouped
+from articulate_ssl.discovery.parallel_axes import with_parallel_axes
 from articulate_ssl.discovery.proposals import load_proposals
 from articulate_ssl.discovery.registered_shape import RegisteredShape
 from articulate_ssl.geometry.rotation_group import rotation_group
@@ -92,8 +93,8 @@ class TrainingRecipe(Recipe):
         network = self.estimator.articulated
         with torch.random.fork_rng(devices=[]), torch.no_grad():
             clouds, found = self._discovered(data, num_points)
-        if network.shared_axis and network.num_parts > 2:
-            found = found.with_parallel_axes()
+            if network.shared_axis and network.num_parts > 2:
+                found = with_parallel_axes(found, clouds, self.discovery)
         # All simulated views are of clouds that fit well.
         kept = slice(None) if self._simulated else found.error.argsort()[: self.discovery.kept(len(clouds))]
         registered = found.of_clouds(kept)

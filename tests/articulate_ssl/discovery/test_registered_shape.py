@@ -7,11 +7,7 @@ from articulated_objects import DRAWER, GLASSES, LAPTOP, clouds, true_shape
 
 from articulate_ssl.discovery.instance_fit import InstanceFit
 from articulate_ssl.discovery.registered_shape import RegisteredShape
-from articulate_ssl.geometry.kinematic_chain import KinematicChain
-from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import se3
-from articulate_ssl.shape.articulated_shape import ArticulatedShape
-from articulate_ssl.shape.joints import Joints
 
 
 def _registered(design) -> RegisteredShape:
@@ -50,27 +46,3 @@ def test_a_scaled_shape_is_posed_as_much_larger():
     found = _registered(GLASSES)
     base = se3(found.base[:, :3, :3], 2 * found.base[:, :3, 3])
     torch.testing.assert_close(found.shape.scaled(2.0).posed(base, found.state), 2 * _posed(found))
-
-
-def test_axes_that_are_parallel_stay():
-    found = _registered(GLASSES)
-    parallel = found.with_parallel_axes()
-    torch.testing.assert_close(_posed(parallel), _posed(found), atol=1e-4, rtol=0)
-
-
-def test_the_axis_that_most_agree_with_is_taken():
-    """Three parallel joints, one of whose axes was found wrong: the other two decide, whichever way they point."""
-    found = _registered(GLASSES)
-    joints = found.shape.joints
-    wrong = torch.nn.functional.normalize(torch.tensor([0.5, 0.6, 0.6]), dim=-1)
-    axis = torch.stack([wrong, joints.axis[0], -joints.axis[0]])
-    chain = KinematicChain(4, 0, (0, 0, 0), (1, 2, 3))
-    label = found.shape.label.clone()
-    label[::7] = 3
-    lines = Joints(chain, axis, torch.cat([joints.pivot, joints.pivot[:1]]), REVOLUTE)
-    state, stretch = torch.zeros(len(found.base), 3), torch.zeros(len(found.base), 4, 3)
-    shape = ArticulatedShape(found.shape.points, label, lines)
-    fixed = RegisteredShape(shape, found.base, state, stretch, found.error).with_parallel_axes()
-    cosine = fixed.shape.joints.axis @ joints.axis[0]
-    assert cosine[1:].tolist() == [1.0, -1.0] and abs(abs(float(cosine[0])) - 1) < 1e-6
-    torch.testing.assert_close(fixed.state, state)
