@@ -87,6 +87,7 @@ def _best_reference(scenes: Iterator[Scene], few: Tensor, registrar: Registrar, 
             f"part discovery found no part that moves in any split of {options.references} clouds: they do not show "
             f"{num_parts} parts that move on their own; check the category's number of parts, or allow more starts"
         )
+    _announce(2 * options.references, options, "which template explains most")
     return best_by_joints(candidates, few, options)
 
 
@@ -110,7 +111,7 @@ def _rounds(found: RegisteredShape, clouds: Tensor, few: Tensor, registrar: Regi
     """Descend on the clouds that fit, register again; the last time to all clouds."""
     options = registrar.options
     for step in range(options.rounds):
-        _announce(2 * options.references + step, options, f"round {step + 1} of {options.rounds}")
+        _announce(2 * options.references + 1 + step, options, f"round {step + 1} of {options.rounds}")
         kept = found.error.argsort()[: options.kept(len(few))]
         fit = found.fit(registrar.generator, kept)
         fit.optimise(few[kept], options.cycles, keep=options.keep)
@@ -133,8 +134,8 @@ def _error(found: RegisteredShape, options: DiscoveryOptions) -> float:
 
 
 def _stages(options: DiscoveryOptions) -> int:
-    """Of roughly the same length, where a smoke run was measured: two for every template, one for every round."""
-    return 2 * options.references + options.rounds
+    """Of roughly the same length: two for every template, one to compare them, one for every round."""
+    return 2 * options.references + 1 + options.rounds
 
 
 def _announce(done: int, options: DiscoveryOptions, name: str) -> None:

@@ -31,7 +31,7 @@ def test_discovery_and_calibration_are_told_in_lines_and_change_nothing(root, ca
     assert "discovery" not in "".join(capsys.readouterr())
     quiet_trainer(root, max_steps=2, callbacks=[ShowProgress()]).fit(watched, tiny_data(root))
     said = capsys.readouterr().err
-    assert "part discovery: template 1 of 1, 0 of 3 done" in said and "part discovery: took" in said
+    assert "part discovery: template 1 of 1, 0 of 4 done" in said and "part discovery: took" in said
     for name, value in alone.state_dict().items():
         assert torch.equal(watched.state_dict()[name], value), name
     trainer = quiet_trainer(root, callbacks=[ShowProgress()])
