@@ -37,7 +37,7 @@ def fit_bodies(splits: list[Split], scene: Scene) -> list[Bodies]:
             continue
         if split.refined:
             error = chamfer_l1(thin, bodies.shape.moved(bodies.pose))
-            refined.append((trimmed_mean(error, options.kept(len(error))), bodies))
+            refined.append((trimmed_mean(error, options), bodies))
         else:
             as_proposed.append(bodies)
     best = sorted(refined, key=lambda candidate: candidate[0])[: options.jointed]

@@ -120,17 +120,13 @@ def _rounds(found: RegisteredShape, clouds: Tensor, few: Tensor, registrar: Regi
             break
         targets = few if step + 1 < options.rounds else clouds
         found = registrar.register(_found(fit, few[kept]), targets)
-        log.info("round %d: error %.4f", step + 1, _error(found, options))
+        log.info("round %d: error %.4f", step + 1, trimmed_mean(found.error, options))
     return found
 
 
 def _found(fit: InstanceFit, clouds: Tensor) -> RegisteredShape:
     found = RegisteredShape.of(fit, clouds)
     return replace(found, shape=found.shape.with_centred_pivots())
-
-
-def _error(found: RegisteredShape, options: DiscoveryOptions) -> float:
-    return trimmed_mean(found.error, options.kept(len(found.error)))
 
 
 def _stages(options: DiscoveryOptions) -> int:

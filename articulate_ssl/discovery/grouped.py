@@ -93,7 +93,7 @@ def discover_grouped(
     candidates = [
         registrar.register(template.shape, collection.few) for template in templates if template.unexplained <= most
     ]
-    found = registrar.register(min(candidates, key=lambda c: _error(c, options)), collection.clouds)
+    found = registrar.register(min(candidates, key=lambda c: trimmed_mean(c.error, options)), collection.clouds)
     _announce(len(objects) + 1, of_object, "done")
     return collection.as_given(found).of_clouds(slice(len(clouds)))
 
@@ -130,7 +130,3 @@ def _announced(objects: list[Tensor]) -> Iterator[Tensor]:
 
 def _announce(done: int, objects: list[Tensor], name: str) -> None:
     announce(log, Stage("discovery from objects", name, done, len(objects) + 1))
-
-
-def _error(found: RegisteredShape, options: DiscoveryOptions) -> float:
-    return trimmed_mean(found.error, options.kept(len(found.error)))

@@ -29,7 +29,7 @@ def best_by_joints(
         return candidates[0]
     scores = []
     for number, found in enumerate(candidates, start=1):
-        error = trimmed_mean(found.error, options.kept(len(clouds)))
+        error = trimmed_mean(found.error, options)
         gain = joint_gain(found, clouds, options)
         log.info("template %d of %d: error %.4f, joints explain %.4f", number, len(candidates), error, gain)
         scores.append(error - gain)

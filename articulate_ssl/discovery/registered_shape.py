@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from articulate_ssl.discovery.instance_fit import InstanceFit
+from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.geometry.orientation_range import mean_rotation
 from articulate_ssl.geometry.se3 import invert_se3, se3
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
@@ -99,6 +100,6 @@ class RegisteredShape:
         return replace(self, shape=self.shape.in_frame(turn), base=base, axes=axes, beside=beside)
 
 
-def trimmed_mean(error: Tensor, count: int) -> float:
-    """Mean of the `count` smallest errors: some clouds are aligned wrongly."""
-    return float(error.sort().values[:count].mean())
+def trimmed_mean(error: Tensor, options: DiscoveryOptions) -> float:
+    """Mean of the errors that count: some clouds are aligned wrongly."""
+    return float(error.sort().values[: options.kept(len(error))].mean())

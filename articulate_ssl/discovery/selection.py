@@ -37,7 +37,7 @@ def descended(fits: list[InstanceFit], clouds: Tensor, cycles: int, options: Dis
     for fit in fits:
         fit.optimise(clouds, cycles, keep=options.keep)
     moving = [fit for fit in fits if fit.shape.smallest_share >= options.min_share and least_motion(fit) > _STILL]
-    return sorted(moving, key=lambda fit: trimmed_mean(fit.error(clouds), options.kept(len(clouds))))
+    return sorted(moving, key=lambda fit: trimmed_mean(fit.error(clouds), options))
 
 
 def least_motion(fit: InstanceFit) -> float:
