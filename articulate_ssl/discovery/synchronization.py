@@ -3,6 +3,11 @@
 Pairs of clouds decide badly (of chests of drawers, a third of all pairs is most alike upside down or front to back), a
 single template hardly better; all pairs together decide well. Group synchronization: choose an element per cloud so
 that all pairs of clouds, turned by theirs, are as alike as possible.
+
+Pairs count by how much they say: two chests that are about as alike one way as another say little, and chests that
+differ in kind, a bedside table and a desk, less than chests that are nearly the same. On three sets of chests 91 to
+94 % of the clouds stood alike in the end by the first, 93 to 96 % by the second after it, 82 to 85 % where all pairs
+count the same (docs/experiments.md, step 98).
 """
 
 from __future__ import annotations
@@ -15,6 +20,7 @@ from articulate_ssl.geometry.rotation_group import RotationGroup
 
 _POINTS = 512  # of a cloud, compared with the field of another
 CAP = 0.1  # distances beyond count as this, in widths of the unit box
+NEIGHBOURS = 8  # clouds most like a cloud, which have the last word about it
 _STARTS, _SWEEPS = 24, 30
 
 
@@ -48,12 +54,33 @@ def synchronise(
 ) -> Tensor:  # [n] int64
     """The element that each cloud is to be turned by, up to one element that is common to all.
 
-    From what single clouds say about all others; each cloud in turn then takes the element that fits all others best.
-    The lowest total cost over all starts wins.
+    From what single clouds say about all others; each cloud in turn then takes the element that fits all others best,
+    every pair weighted by how decided it is. The lowest total cost over all starts wins. From there on each cloud
+    takes the element that fits those best that it is most like.
     """
+    decided = costs * decidedness(costs)[..., None]
     first = torch.randint(len(costs), (_STARTS,), generator=generator).tolist()
-    found = [_descend(costs, costs[start].argmin(dim=-1), group, generator) for start in first]
-    return min(found, key=lambda element: total_cost(costs, element, group))
+    found = [_descend(decided, decided[start].argmin(dim=-1), group, generator) for start in first]
+    best = min(found, key=lambda element: total_cost(decided, element, group))
+    return _descend(costs * _neighbours(costs)[..., None], best, group, generator)
+
+
+def decidedness(
+    costs: Tensor,  # [n, n, G]
+) -> Tensor:  # [n, n]
+    """By how much the best element of a pair is better than the second best."""
+    best, second = costs.topk(2, dim=-1, largest=False).values.unbind(-1)
+    return second - best
+
+
+def _neighbours(
+    costs: Tensor,  # [n, n, G]
+) -> Tensor:  # [n, n]
+    """One for pairs of which one is among the clouds most like the other, else zero."""
+    least = costs.amin(dim=-1).fill_diagonal_(torch.inf)
+    near = least.topk(min(NEIGHBOURS, len(costs) - 1), dim=1, largest=False).indices
+    chosen = torch.zeros_like(least).scatter_(1, near, 1.0)
+    return torch.maximum(chosen, chosen.T)
 
 
 def total_cost(costs: Tensor, element: Tensor, group: RotationGroup) -> float:

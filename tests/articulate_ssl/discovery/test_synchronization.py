@@ -32,6 +32,22 @@ def test_all_pairs_together_decide_what_two_thirds_of_them_get_wrong(order):
     assert total_cost(costs, found, group) == pytest.approx(total_cost(costs, element, group), rel=1e-5)
 
 
+def test_pairs_that_say_little_do_not_outvote_those_that_say_much():
+    group, generator = rotation_group(24), torch.Generator().manual_seed(2)
+    element, other = (torch.randint(len(group), (40,), generator=generator) for _ in range(2))
+    true, misleading = (group.product[group.inverse[e]][:, e][..., None] for e in (element, other))
+    # Seven in ten pairs favour the misleading elements, but barely more than the true ones.
+    costs = torch.full((40, 40, len(group)), 1.5).scatter(2, true, 1.0).scatter(2, misleading, 0.95)
+    decided = torch.full((40, 40, len(group)), 1.0).scatter(2, true, 0.9)
+    says_much = torch.rand(40, 40, generator=generator) < 0.3
+    costs = torch.where(says_much[..., None], decided, costs)
+    costs = torch.triu(costs.permute(2, 0, 1), 1).permute(1, 2, 0)
+    costs = costs + costs.transpose(0, 1)[..., group.inverse]
+    assert total_cost(costs, other, group) < total_cost(costs, element, group)
+    common = group.product[synchronise(costs, group, generator), group.inverse[element]]
+    assert (common == common.mode().values).all()
+
+
 def test_a_common_element_changes_no_cost():
     group, generator = rotation_group(24), torch.Generator().manual_seed(1)
     element, costs = _planted(group, 10, wrong=0.3, generator=generator)
