@@ -24,8 +24,8 @@ from articulate_ssl.geometry.se3 import se3
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.joints import Joints
 
-# Of 540 clouds of unseen chests of three sets, the first turn was right for 93 to 94 % by those that a cloud is most like
-# of 128, 90 % by 32, and for 85 % by all of 128 alike (docs/experiments.md, step 98).
+# Of 540 clouds of unseen chests of three sets, the first turn was right for 90 to 96 % by the clouds most alike of 128,
+# for 85 to 92 % by those of 32, and for 80 to 91 % by all 128 (docs/experiments.md, step 98).
 _GALLERY, _GALLERY_POINTS = 128, 512
 _TURNS = 2  # the likeliest, and its rival
 _FITTED_POINTS = 1024  # of a cloud, to which the shape is fitted
@@ -106,7 +106,7 @@ class SlidingSearch(nn.Module):
 
         Returns:
             The shapes of 2 B candidates, stretched to the clouds' proportions (points [2 B, K M, 3]), their base poses
-            [B, 2, 4, 4] and joint states [B, 2, J], and how far the clouds are from those of the gallery most alike [B, 2].
+            [B, 2, 4, 4] and joint states [B, 2, J], and how far the clouds of the gallery most alike are [B, 2].
         """
         device, clouds = clouds.device, clouds.cpu().clone()  # a normal tensor, also where it was none
         turn, cost = self.turns(clouds)
