@@ -6,6 +6,7 @@
 3. *Registration* at test time: the leading hypotheses' predicted shapes are registered to the cloud without leaving
    their joints, and the best reconstruction wins.
    Where parts slide, the category's own shape is looked for, too, in the frame of the cloud (`sliding_search`).
+   Where simulated views taught, those that a view is most like decide which way round it is (`view_search`).
 4. *Decision*, where a category's clouds can be explained in two ways that fit alike: the relief of all points decides
    between the winner and its twin (`two_ways`), which is registered, too, if the winner was.
 5. *Hand*, where upright cameras see objects and their mirror images: clouds are explained in a mirror, too, and how
@@ -36,6 +37,7 @@ from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.inference.relief import NUM_FEATURES, describe_relief
 from articulate_ssl.inference.sliding_search import SlidingSearch
 from articulate_ssl.inference.two_ways import TwoWays
+from articulate_ssl.inference.view_search import ViewSearch
 from articulate_ssl.losses.reconstruction import distances_to_parts
 from articulate_ssl.network.articulated_network import ArticulatedNetwork
 from articulate_ssl.network.heads.shape import CanonicalShape
@@ -43,7 +45,7 @@ from articulate_ssl.network.hypotheses import Hypotheses, either
 from articulate_ssl.network.rigid_alignment import RigidAlignment
 from articulate_ssl.ops.chamfer import chamfer, hypothesis_distances
 from articulate_ssl.ops.kd_tree import kd_tree
-from articulate_ssl.shape.observation import Observation
+from articulate_ssl.shape.observation import FAR, Observation
 from articulate_ssl.shape.stretch import principal_directions
 
 _SIDE = 1 / 3  # of the width of a joint's range, from its middle, where a search without a network starts, too
@@ -98,6 +100,7 @@ class PoseEstimator:
         agreement, compared: See `Iteration`; recipes may set them.
         two_ways: The decision between explanations that fit alike, if one was learnt; a module owns it.
         sliding: The search for parts that slide, if one was learnt; a module owns it.
+        view_search: The search among simulated views, if there were any; a module owns it.
         handedness: Whether clouds show the category's mirror image, if some do; a module owns it.
     """
 
@@ -117,6 +120,7 @@ class PoseEstimator:
         self.observation, self.posterior_scale, self.inference = observation, posterior_scale, inference
         self.two_ways = TwoWays(articulated.num_parts, articulated.num_parts * NUM_FEATURES)
         self.sliding = SlidingSearch(*articulated.category.template.shape[:2])
+        self.view_search = ViewSearch(articulated.num_parts - 1)
         self.handedness = Handedness()
 
     def align(self, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -225,11 +229,12 @@ class PoseEstimator:
         """See `predict_with_rivals`: by the category's own hand."""
         with torch.autocast(points.device.type, enabled=False):
             registers = (self.inference.refine if refine is None else refine) is not False
-            candidates = self._candidates(points, num_points, registers)
-            if registers and dense is not None and self.sliding.learnt:
-                chosen, other, margin = self._slid(points, dense, candidates)
+            if registers and self.view_search.learnt:
+                chosen, other, margin = self._seen(points, num_points)
+            elif registers and dense is not None and self.sliding.learnt:
+                chosen, other, margin = self._slid(points, dense, self._candidates(points, num_points, registers))
             else:
-                chosen, other, margin = self._best(candidates)
+                chosen, other, margin = self._best(self._candidates(points, num_points, registers))
             if dense is not None and self.two_ways.learnt:
                 chosen, other, margin = self._decided(chosen, points, dense, registers)
             return self._prediction(chosen, points, margin), self._prediction(other, points, torch.zeros_like(margin))
@@ -267,12 +272,23 @@ class PoseEstimator:
         twin = self._twin(chosen, points, registers=True)
         return [(self._relief(chosen, clouds), self._relief(twin, clouds)) for clouds in dense]
 
-    def _candidates(self, points: Tensor, num_points: int, registers: bool) -> Candidates:
-        """The network's hypotheses, or the leading ones registered, in the frame of the points."""
+    def _candidates(
+        self,
+        points: Tensor,  # [B, N, 3]
+        num_points: int,
+        registers: bool,
+        turn: Tensor | None = None,  # [B, 3, 3] canonical object space -> camera
+    ) -> Candidates:
+        """The network's hypotheses, or the leading ones registered, in the frame of the points.
+
+        Args:
+            turn: Of those, hypotheses that are not turned about so are registered only where too few are.
+        """
         aligned, pose = self.align(points[:, :num_points])
         *_, last = self.iterate(aligned)
         if registers:
-            candidates, error = self._refine(last, transform_points(invert_se3(pose), points))
+            turn = None if turn is None else pose[:, :3, :3].mT @ turn
+            candidates, error = self._refine(last, transform_points(invert_se3(pose), points), turn)
         else:
             candidates, error = last.hypotheses, last.distance
         candidates = candidates.at(pose[:, None] @ candidates.base, candidates.state)
@@ -305,10 +321,28 @@ class PoseEstimator:
         if others is None:
             return first, rival, margin
         error = chamfer_l1(points, first.posed()[:, 0].flatten(1, 2), self.observation.bidirectional)
-        turn = first.base[:, :, :3, :3].expand_as(others.base[..., :3, :3])
-        away = roma.rotmat_geodesic_distance(others.base[..., :3, :3], turn) > ANOTHER_WAY
-        least, index = others.error.masked_fill(away, torch.inf).min(dim=1)
-        return either(error <= least, first, others.select(index)), rival, margin
+        return _better(first, error, others, first.base[:, 0, :3, :3]), rival, margin
+
+    def _seen(
+        self,
+        points: Tensor,  # [B, N, 3]
+        num_points: int | None = None,
+    ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
+        """The category's shape, registered from where the search among simulated views finds it, and its rival.
+
+        Which way round objects are, the search decides. With `num_points` the network's hypotheses that are turned
+        alike compete by their errors.
+
+        Returns:
+            Both, and the margin between them.
+        """
+        base, state, margin = self.view_search.search(points)
+        likelier, rival = (self.articulated.category_at(base[:, i, None], state[:, i, None]) for i in range(2))
+        first, error = self._registered(likelier, points)
+        if num_points is None:
+            return first, rival, margin
+        turn = base[:, 0, :3, :3]
+        return _better(first, error[:, 0], self._candidates(points, num_points, True, turn), turn), rival, margin
 
     def _twin(
         self,
@@ -356,7 +390,8 @@ class PoseEstimator:
 
         They are searched (`search_articulated`) from the 60 rotations of the icosahedron, those within the orientation
         range, and from joints in the middle of their range and, in every combination, at either side of it; 3 states
-        for one joint. Where parts slide, `sliding_search` takes the place of that, if there are dense clouds.
+        for one joint. Where parts slide, `sliding_search` takes the place of that, if there are dense clouds, and
+        `view_search` where simulated views taught.
         """
         seen = self._searched(points, state_range, dense)
         if not self.handedness.learnt:
@@ -368,6 +403,9 @@ class PoseEstimator:
     def _searched(self, points: Tensor, state_range: Tensor, dense: Tensor | None) -> Prediction:
         """See `search`: by the category's own hand."""
         with torch.autocast(points.device.type, enabled=False):
+            if self.view_search.learnt:
+                found, _, margin = self._seen(points)
+                return self._prediction(found, points, margin)
             if dense is not None and self.sliding.learnt:
                 found, _, margin = self._slid(points, dense)
                 return self._prediction(found, points, margin)
@@ -384,11 +422,21 @@ class PoseEstimator:
                 found, _, margin = self._decided(found, points, dense, registers=True)
             return self._prediction(found, points, margin)
 
-    def _refine(self, last: Iteration, points: Tensor) -> tuple[Hypotheses, Tensor]:
+    def _refine(self, last: Iteration, points: Tensor, turn: Tensor | None) -> tuple[Hypotheses, Tensor]:
         """The leading hypotheses after articulated registration of the predicted shape, and their errors."""
-        options, hypotheses = self.inference, last.hypotheses
-        count = min(options.candidates, hypotheses.base.shape[1])
-        candidates = hypotheses.select(last.leading(count))
+        ranked, rotation = last.ranked, last.hypotheses.base[..., :3, :3]
+        if turn is not None:
+            ranked = ranked + FAR * (_angle(rotation, turn) > ANOTHER_WAY)
+        leading = ranked.topk(min(self.inference.candidates, ranked.shape[1]), largest=False).indices
+        return self._registered(last.hypotheses.select(leading), points)
+
+    def _registered(
+        self,
+        candidates: Hypotheses,  # H = C
+        points: Tensor,  # [B, N, 3]
+    ) -> tuple[Hypotheses, Tensor]:  # H = C, [B, C]
+        """Hypotheses after articulated registration of their shapes, and their errors."""
+        options = self.inference
         scales = options.coarse_scale, options.fine_scale
         base, state, error = self.register(candidates, points, scales, options.rounds)
         registered = candidates.at(base, state)
@@ -442,6 +490,25 @@ class PoseEstimator:
             reconstruction_error=chamfer(points, posed.flatten(1, 2), bidirectional=self.observation.bidirectional),
             margin=margin,
         )
+
+
+def _better(
+    first: Hypotheses,  # H = 1
+    error: Tensor,  # [B]
+    others: Candidates,
+    turn: Tensor,  # [B, 3, 3]
+) -> Hypotheses:  # H = 1
+    """Of a hypothesis of every cloud, and those of others that are turned about so, the one with the least error."""
+    away = _angle(others.base[..., :3, :3], turn) > ANOTHER_WAY
+    least, index = others.error.masked_fill(away, torch.inf).min(dim=1)
+    return either(error <= least, first, others.select(index))
+
+
+def _angle(
+    rotation: Tensor,  # [B, C, 3, 3]
+    turn: Tensor,  # [B, 3, 3]
+) -> Tensor:  # [B, C]
+    return roma.rotmat_geodesic_distance(rotation, turn[:, None].expand_as(rotation))
 
 
 def _joint_lines(

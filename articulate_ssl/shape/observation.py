@@ -8,7 +8,7 @@ from torch import Tensor
 
 from articulate_ssl.geometry.orientation_range import OrientationRange
 
-_FAR = 1e3  # more than any distance between normalised clouds
+FAR = 1e3  # more than any distance between normalised clouds
 
 
 @dataclass(frozen=True)
@@ -35,4 +35,4 @@ class Observation:
         rotation: Tensor,  # [..., 3, 3] of the hypotheses
     ) -> Tensor:  # [...]
         """Errors to choose hypotheses by: those that are turned too far come last."""
-        return error + _FAR * ~self.orientation.contains(rotation)
+        return error + FAR * ~self.orientation.contains(rotation)

@@ -129,7 +129,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             self.articulated, self.rigid, iterations, observation, objective.posterior_scale, inference
         )
         self.two_ways, self.sliding = self.estimator.two_ways, self.estimator.sliding
-        self.handedness = self.estimator.handedness
+        self.view_search, self.handedness = self.estimator.view_search, self.estimator.handedness
         self.recipe = recipe_type(self.estimator, objective, schedule, discovery)
         self.radius = RadiusStatistics()
         self.states = StateRange(num_parts - 1)

@@ -66,6 +66,7 @@ def test_which_object_a_cloud_shows_reaches_discovery(tmp_path, seen, labelled):
     module = tiny_module(discovery=GROUPED)
     fit(module, tmp_path, 1)
     assert seen.keys() == {"grouped"}
+    assert not module.view_search.learnt
     clouds, scans, instance, *category = seen["grouped"]
     assert category == [2, module.articulated.joint_type, GROUPED]
     assert scans.shape == (18, 128, 3) and scans.dtype == torch.float32
@@ -132,6 +133,9 @@ def test_views_are_taught_by_scans_of_the_category(tmp_path, monkeypatch):
     points, target = module.recipe._registered_clouds(5, torch.Generator().manual_seed(0), torch.device("cpu"))
     assert all((one == module.recipe.found.points).all(dim=(1, 2)).any() for one in points)
     assert torch.equal(target.base[:, :3, :3], torch.eye(3).expand(5, 3, 3))
+    # A search among them decides which way round views are.
+    torch.testing.assert_close(module.view_search.views.float(), module.recipe.found.points, atol=1e-3, rtol=0)
+    assert torch.equal(module.view_search.state, module.recipe.found.state)
     # Whose part is known counts for it, whatever lies nearer; the checkpoint keeps it.
     which = (points[:, None] == module.recipe.found.points).all(dim=(2, 3)).int().argmax(dim=1)
     assert torch.equal(target.point_part, parts[which])

@@ -1,0 +1,136 @@
+"""Which way round objects are in views is as in the simulated views most like them, whatever a network says."""
+
+import pytest
+import roma
+import torch
+from articulated_objects import OVEN, Clouds, clouds
+
+from articulate_ssl.geometry.kinematic_chain import KinematicChain
+from articulate_ssl.geometry.orientation_range import OrientationRange
+from articulate_ssl.geometry.screw import REVOLUTE
+from articulate_ssl.geometry.se3 import se3, transform_points
+from articulate_ssl.inference.pose_estimation import InferenceOptions, PoseEstimator
+from articulate_ssl.inference.view_search import ViewSearch
+from articulate_ssl.network.articulated_network import ArticulatedNetwork
+from articulate_ssl.network.options import NetworkOptions
+from articulate_ssl.shape.articulated_shape import ArticulatedShape
+from articulate_ssl.shape.joints import Joints
+from articulate_ssl.shape.observation import Observation
+
+RANGE = OrientationRange(100.0)
+CHAIN = KinematicChain(2, 0, (0,), (1,))
+OVER = torch.diag(torch.tensor([-1.0, 1.0, -1.0]))
+
+
+def _views(count: int, seed: int) -> Clouds:
+    """Turned within the range; whole objects stand for views of them."""
+    data = clouds(OVEN, count=count, points=512, resample=True, seed=seed)
+    turn = RANGE.draw(count, torch.Generator().manual_seed(seed)) @ data.base[:, :3, :3].mT
+    turn = se3(turn, turn.new_zeros(count, 3))
+    return data._replace(points=transform_points(turn, data.points), base=turn @ data.base)
+
+
+def _learnt(data: Clouds) -> ViewSearch:
+    search = ViewSearch(1)
+    assert not search.learnt
+    search.learn(data.points, data.base, data.state)
+    return search
+
+
+@pytest.fixture(scope="module")
+def learnt():
+    """A search that has learnt from many views."""
+    return _learnt(_views(300, seed=0))
+
+
+def _degrees(a, b):
+    return roma.rotmat_geodesic_distance(a, b).rad2deg()
+
+
+def test_unseen_views_are_found_and_rivals_are_turned_another_way(learnt):
+    data = _views(6, seed=1)
+    base, state, margin = learnt.search(data.points)
+    assert base.shape == (6, 2, 4, 4) and state.shape == (6, 2, 1) and margin.shape == (6,)
+    assert _degrees(base[:, 0, :3, :3], data.base[:, :3, :3]).max() < 20
+    assert (state[:, 0] - data.state).abs().max() < 0.6
+    back = transform_points(torch.linalg.inv(base[:, 0]), data.points)
+    truth = transform_points(torch.linalg.inv(data.base), data.points)
+    assert (back - truth).norm(dim=-1).mean() < 0.1
+    unsure = margin < 1
+    apart = _degrees(base[:, 0, :3, :3], base[:, 1, :3, :3])
+    assert (apart[unsure] > 30).all() and (apart[~unsure] < 1e-2).all()
+
+
+def test_views_that_were_turned_over_turn_predictions_over(learnt):
+    data = _views(3, seed=2)
+    other = ViewSearch(1)
+    other.load_state_dict(learnt.state_dict())
+    other.base = learnt.base @ se3(OVER, torch.zeros(3))
+    found, turned = (search.search(data.points)[0][:, 0, :3, :3] for search in (learnt, other))
+    torch.testing.assert_close(turned, found @ OVER)
+
+
+def test_views_do_not_interact_and_what_was_learnt_is_saved(learnt):
+    data = _views(3, seed=3)
+    again = ViewSearch(1)
+    # Files of weights give all numbers as float32.
+    again.load_state_dict({name: value.float() for name, value in learnt.state_dict().items()})
+    assert again.learnt and again.views.dtype == torch.float16
+    for together, alone in zip(learnt.search(data.points), again.search(data.points[1:2]), strict=True):
+        torch.testing.assert_close(together[1:2], alone, atol=1e-5, rtol=0)
+
+
+def test_weights_from_before_there_was_a_search_have_none():
+    search = ViewSearch(2)
+    search.load_state_dict({})
+    assert not search.learnt
+
+
+def test_few_views_of_few_points_will_do():
+    data = _views(5, seed=4)
+    search = _learnt(data._replace(points=data.points[:, :100]))
+    base, _, margin = search.search(data.points[:2, :90])
+    assert base.isfinite().all() and margin.isfinite().all()
+
+
+@pytest.fixture(scope="module")
+def estimator(learnt):
+    """With a network that has learnt nothing."""
+    data = _views(1, seed=0)
+    points = torch.cat([data.rest[data.part == part][:200].repeat(2, 1)[:200] for part in range(2)])
+    shape = ArticulatedShape(
+        points, torch.arange(2).repeat_interleave(200), Joints(CHAIN, data.axis, data.pivot, REVOLUTE)
+    )
+    options = NetworkOptions(
+        group_order=12, dims=(8, 8, 8), num_neighbors=8, num_centers=(128, 64, 32), head_dim=8, shape_points=200
+    )
+    torch.manual_seed(0)
+    network = ArticulatedNetwork(options, 2, REVOLUTE).eval()
+    made = PoseEstimator(network, None, 1, Observation(RANGE, True), 0.05, InferenceOptions(refine=True))
+    network.category.adopt(shape)
+    return made
+
+
+def test_the_search_decides_and_hypotheses_turned_alike_compete(learnt, estimator):
+    data = _views(3, seed=5)
+    points, truth = data.points[:, :256], data.base[:, :3, :3]
+    before = estimator.predict(points, 256)
+    unregistered = estimator.predict(points, 256, refine=False)
+    assert _degrees(before.base_pose[:, :3, :3], truth).max() > 30
+    estimator.view_search.load_state_dict(learnt.state_dict())
+    with torch.inference_mode():  # as a trainer tests
+        found, rival = estimator.predict_with_rivals(points.clone(), 256)
+    for prediction in (found, estimator.search(points, torch.zeros(1, 2))):
+        assert _degrees(prediction.base_pose[:, :3, :3], truth).max() < 20
+        assert (prediction.joint_state - data.state).abs().median() < 0.3
+    unsure = found.margin < 1
+    assert (_degrees(found.base_pose[:, :3, :3], rival.base_pose[:, :3, :3])[unsure] > 20).all()
+    # Without registration the network answers alone.
+    again = estimator.predict(points, 256, refine=False)
+    torch.testing.assert_close(again.base_pose, unregistered.base_pose)
+    # The network's hypotheses that are turned as the search says are registered, and win where they fit better.
+    turn = estimator.view_search.search(points)[0][:, 0, :3, :3]
+    others = estimator._candidates(points, 256, True, turn)
+    near = _degrees(others.base[..., :3, :3], turn[:, None].expand(-1, others.base.shape[1], -1, -1)) < 30
+    least = others.error.masked_fill(~near, torch.inf).amin(dim=1)
+    assert (found.reconstruction_error <= least + 1e-3).all()
