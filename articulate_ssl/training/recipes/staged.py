@@ -108,7 +108,7 @@ class TrainingRecipe(Recipe):
         )
         network.category.adopt(found.shape)
         if self._simulated:
-            self.estimator.view_search.learn(clouds, registered.base, registered.state)
+            self.estimator.view_search.learn(clouds, registered.base, registered.state, registered.point_part)
         if found.axes is not None and not self._simulated:  # in a frame that the clouds share
             shape = network.category.articulated_shape(network.joint_type)
             self.estimator.sliding.learn(shape, found.limits(), clouds[kept], registered.base)

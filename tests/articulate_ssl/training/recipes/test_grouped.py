@@ -136,6 +136,7 @@ def test_views_are_taught_by_scans_of_the_category(tmp_path, monkeypatch):
     # A search among them decides which way round views are.
     torch.testing.assert_close(module.view_search.views.float(), module.recipe.found.points, atol=1e-3, rtol=0)
     assert torch.equal(module.view_search.state, module.recipe.found.state)
+    assert torch.equal(module.view_search.part.long(), parts)
     # Whose part is known counts for it, whatever lies nearer; the checkpoint keeps it.
     which = (points[:, None] == module.recipe.found.points).all(dim=(2, 3)).int().argmax(dim=1)
     assert torch.equal(target.point_part, parts[which])
