@@ -27,7 +27,8 @@ _COMPARED = 128  # points of each by which all are compared with a cloud
 _NEAREST = 30  # views that are registered to the cloud
 _SCALES, _ROUNDS = (0.08, 0.03), 6  # of that registration
 _VOTING = 5  # of those, with the least errors, that say which parts points are of
-_BUFFERS = ("views", "part", "base", "state")
+_STEPS = 127  # in which the largest coordinate of a view is kept; errors are a tenth of the points' spacing
+_BUFFERS = ("views", "step", "part", "base", "state")
 
 
 class Seen(NamedTuple):
@@ -51,7 +52,8 @@ class ViewSearch(nn.Module):
     """Poses, joint states and parts of the simulated views that a depth view is most like.
 
     Attributes:
-        views: [V, P, 3] float16, simulated; none before anything was learnt.
+        views: [V, P, 3] int8, simulated, in steps of length `step`; none before anything was learnt.
+        step: [V]
         part: [V, P] uint8, which part their points are of.
         base: [V, 4, 4] canonical object space -> view.
         state: [V, J] joint states.
@@ -60,7 +62,8 @@ class ViewSearch(nn.Module):
     def __init__(self, num_parts: int) -> None:
         super().__init__()
         self.num_parts = num_parts
-        self.register_buffer("views", torch.zeros(0, _POINTS, 3, dtype=torch.float16))
+        self.register_buffer("views", torch.zeros(0, _POINTS, 3, dtype=torch.int8))
+        self.register_buffer("step", torch.zeros(0))
         self.register_buffer("part", torch.zeros(0, _POINTS, dtype=torch.uint8))
         self.register_buffer("base", torch.zeros(0, 4, 4))
         self.register_buffer("state", torch.zeros(0, num_parts - 1))
@@ -79,9 +82,11 @@ class ViewSearch(nn.Module):
     ) -> None:
         """Keep some of these views, spread evenly."""
         some = torch.linspace(0, len(views) - 1, min(len(views), _VIEWS)).round().long()
-        self.views = views[some, :_POINTS].to(self.views.device, torch.float16, copy=True)
+        views = views[some, :_POINTS]
+        step = views.abs().amax(dim=(1, 2)) / _STEPS
+        self.views = (views / step[:, None, None]).round().to(self.views)
         self.part = part[some, :_POINTS].to(self.part, copy=True)
-        self.base, self.state = (value[some].to(self.base, copy=True) for value in (base, state))
+        self.step, self.base, self.state = (value.to(self.base, copy=True) for value in (step, base[some], state[some]))
 
     @torch.no_grad()
     def search(
@@ -89,7 +94,8 @@ class ViewSearch(nn.Module):
         points: Tensor,  # [B, N, 3] depth views, farthest-point order
     ) -> Seen:
         """Compare with all views, register those that are most alike, and ask the best of these."""
-        views, base, state = (value.to(points) for value in (self.views, self.base, self.state))
+        views, step, base, state = (value.to(points) for value in (self.views, self.step, self.base, self.state))
+        views = views * step[:, None, None]
         thin, still = views[:, :_COMPARED].contiguous(), torch.eye(3).to(points)[None]
         found, states, errors, votes = [], [], [], []
         for cloud in points:

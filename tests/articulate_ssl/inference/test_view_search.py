@@ -78,7 +78,7 @@ def test_views_do_not_interact_and_what_was_learnt_is_saved(learnt):
     # Files of weights give all numbers as float32.
     read = {name: value.float() if value.is_floating_point() else value for name, value in learnt.state_dict().items()}
     again.load_state_dict(read)
-    assert again.learnt and again.views.dtype == torch.float16
+    assert again.learnt and again.views.dtype == torch.int8
     for together, alone in zip(learnt.search(data.points), again.search(data.points[1:2]), strict=True):
         torch.testing.assert_close(together[1:2], alone, atol=1e-5, rtol=0)
 
