@@ -56,8 +56,9 @@ class Collection:
         few = clouds[:: max(1, len(clouds) // options.search_clouds)][: options.search_clouds]
         return Collection(clouds, few, frame, rotations, registrar)
 
-    def as_given(self, found: RegisteredShape) -> RegisteredShape:
-        """What was registered to all clouds, to the clouds as they were given."""
+    def as_given(self, found: RegisteredShape, rows: slice = slice(None)) -> RegisteredShape:
+        """What was registered to all clouds, or some, to the clouds as they were given."""
         if self.frame is None:
             return found
-        return replace(found, base=se3(self.frame.mT, self.frame.new_zeros(3)) @ found.base)
+        back = self.frame[rows].mT
+        return replace(found, base=se3(back, back.new_zeros(3)) @ found.base)

@@ -8,6 +8,9 @@ without its name. What is used is which recordings are of one object, no label.
    single-cloud discovery would see (`registrar`), which are of as many objects as possible; the one stays that explains
    them best, and is registered to all. Clouds of a few whole objects say less: one that the collection turns over is a
    large part of it.
+3. Where parts slide, one template says badly which part a point is of. There many objects are found from their clouds,
+   their parts named alike (`named_alike`), and clouds of all of them say for every cloud, by those most like it, which
+   part its points are of (`similar_clouds`); the shape is then placed by that (`part_boxes`).
 
 Descent on the whole category, which `discover` ends with, gives points to parts anew, and worse than an object's own
 clouds do: it took the template's labels from an IoU of .68 to .43 on chests, from .94 to .93 on laptops.
@@ -17,6 +20,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -24,11 +28,16 @@ from torch import Tensor
 
 from articulate_ssl.discovery.collection import Collection
 from articulate_ssl.discovery.discover import DiscoveryError
+from articulate_ssl.discovery.named_alike import ObjectParts, named_alike
 from articulate_ssl.discovery.one_object.find import MIN_CLOUDS, find_one_object
 from articulate_ssl.discovery.one_object.template import as_template
 from articulate_ssl.discovery.options import DiscoveryOptions
+from articulate_ssl.discovery.part_boxes import fit_part_boxes
 from articulate_ssl.discovery.references import choose_objects
 from articulate_ssl.discovery.registered_shape import RegisteredShape, trimmed_mean
+from articulate_ssl.discovery.similar_clouds import LabelledClouds
+from articulate_ssl.discovery.synchronization import unit_boxes
+from articulate_ssl.geometry.screw import PRISMATIC
 from articulate_ssl.ops.denormals import flush_denormals
 from articulate_ssl.ops.progress import Stage, announce
 from articulate_ssl.shape.observation import Observation
@@ -44,10 +53,15 @@ log = logging.getLogger(__name__)
 
 
 class _Template(NamedTuple):
-    """An object as a category's shape, and the share of its clouds' points that its parts do not explain."""
+    """An object as a category's shape, and the share of its clouds' points that its parts do not explain.
+
+    Attributes:
+        parts: Its parts in its clouds, where all of the collection share a frame.
+    """
 
     shape: RegisteredShape
     unexplained: float
+    parts: ObjectParts | None
 
 
 @flush_denormals()
@@ -64,7 +78,8 @@ def discover_grouped(
     Raises:
         DiscoveryError: if no object has scans enough, or the parts of none are found.
     """
-    objects = choose_objects(scans[:, : options.dense_points], instance, options.references, MIN_CLOUDS)
+    count, most_clouds = (options.objects, MIN_CLOUDS) if joint_type == PRISMATIC else (options.references, MOST_CLOUDS)
+    objects = choose_objects(scans[:, : options.dense_points], instance, count, MIN_CLOUDS)
     if not len(objects):
         raise DiscoveryError(
             f"discovery.grouped needs an object with {MIN_CLOUDS} clouds or more among the {len(scans)} of discovery; "
@@ -72,9 +87,9 @@ def discover_grouped(
             '(`make data ... ARGS="--states 10"`), put all scans of an object into one folder (SOURCE=clouds), allow '
             "more --model.discovery.clouds, or leave grouped out"
         )
-    of_object = [_some((instance == one).nonzero().squeeze(-1)) for one in objects]
+    of_object = [_some((instance == one).nonzero().squeeze(-1), most_clouds) for one in objects]
     collection = Collection.of(torch.cat([clouds, scans[torch.cat(of_object)]]), joint_type, options, Observation())
-    registrar, templates, last = collection.registrar, [], len(clouds)
+    templates, last = [], len(clouds)
     for number, rows in enumerate(_announced(of_object), start=1):
         first, last = last, last + len(rows)
         frame = None if collection.frame is None else collection.frame[first:last]
@@ -89,18 +104,22 @@ def discover_grouped(
             f"part discovery found the parts of none of {len(objects)} objects in the clouds of each: check number of "
             "parts and the type of joint, allow more --model.discovery.references, or leave grouped out"
         )
-    most = max(_UNDERSTOOD, _MOST_UNEXPLAINED * min(template.unexplained for template in templates))
-    candidates = [
-        registrar.register(template.shape, collection.few) for template in templates if template.unexplained <= most
-    ]
-    found = registrar.register(min(candidates, key=lambda c: trimmed_mean(c.error, options)), collection.clouds)
+    given = slice(len(clouds))
+    if collection.frame is None:
+        candidates = [
+            collection.registrar.register(template.shape, collection.few) for template in _understood(templates)
+        ]
+        best = min(candidates, key=lambda candidate: trimmed_mean(candidate.error, options))
+        found = collection.registrar.register(best, collection.clouds).of_clouds(given)
+    else:
+        found = _placed(templates, clouds @ collection.frame[given].mT, options)
     _announce(len(objects) + 1, of_object, "done")
-    return collection.as_given(found).of_clouds(slice(len(clouds)))
+    return collection.as_given(found, given)
 
 
-def _some(rows: Tensor) -> Tensor:
-    """At most `MOST_CLOUDS` of them, spread evenly."""
-    return rows[torch.linspace(0, len(rows) - 1, min(len(rows), MOST_CLOUDS)).round().long()]
+def _some(rows: Tensor, most: int) -> Tensor:
+    """At most so many of them, spread evenly."""
+    return rows[torch.linspace(0, len(rows) - 1, min(len(rows), most)).round().long()]
 
 
 def _template(
@@ -117,7 +136,40 @@ def _template(
             f"{found.unexplained:.0%} of the points of its clouds lie off all its other clouds: not one object, or of "
             "different sizes"
         )
-    return _Template(as_template(found, options.dense_points, frame), found.unexplained)
+    shape, parts = as_template(found, options.dense_points, frame), None
+    if frame is not None:
+        # As most of its clouds stand; the others the collection has turned over.
+        standing = scans[:, : found.label.shape[1]] @ (shape.base[:, :3, :3].mT @ frame).mT
+        parts = ObjectParts(unit_boxes(standing)[0], found.label, found.shape.joints.chain.root)
+    return _Template(shape, found.unexplained, parts)
+
+
+def _understood(templates: list[_Template]) -> list[_Template]:
+    """Those that are understood well, or about as well as the best."""
+    most = max(_UNDERSTOOD, _MOST_UNEXPLAINED * min(template.unexplained for template in templates))
+    return [template for template in templates if template.unexplained <= most]
+
+
+def _placed(
+    templates: list[_Template],
+    clouds: Tensor,  # [n, N, 3] in the common frame
+    options: DiscoveryOptions,
+) -> RegisteredShape:
+    """The template that fits best where its parts are placed by what similar clouds say that points are of."""
+    templates = sorted(templates, key=lambda template: template.unexplained)
+    num_parts, dense = templates[0].shape.shape.num_parts, clouds[:, : options.dense_points]
+    objects = [template.parts for template in templates]
+    names = named_alike(objects, num_parts)
+    labels = torch.cat([name[one.label] for name, one in zip(names, objects, strict=True)])
+    labelled = LabelledClouds(torch.cat([one.boxes for one in objects]), labels)
+    part, candidates = labelled.votes(unit_boxes(clouds)[0], num_parts).argmax(dim=-1), []
+    tried = _understood(templates)[: options.references]
+    for template, name in zip(tried, names, strict=False):
+        own = name.argsort()  # its number for every common part
+        fit = fit_part_boxes(template.shape.shape, dense, own[part][:, : options.dense_points])
+        found = replace(RegisteredShape.of(fit, dense), point_part=own[part])
+        candidates.append(replace(found, labelled=labelled._replace(part=own[labels])))
+    return min(candidates, key=lambda candidate: trimmed_mean(candidate.error, options))
 
 
 def _announced(objects: list[Tensor]) -> Iterator[Tensor]:

@@ -19,6 +19,7 @@ class DiscoveryOptions:
         dense_points: The same where it is decided between registrations.
         references: Typical clouds, or `grouped` objects, that are tried as the template. Every second one may be split
             wrongly.
+        objects: Of `grouped` objects whose parts slide, those whose parts are found, each from its own clouds.
         proposals: What proposes splits, in this order: modules of `discovery.proposals`, or with dots in their names
             modules from anywhere.
         starts: Random splits of each reference.
@@ -40,6 +41,7 @@ class DiscoveryOptions:
     points: int = 256
     dense_points: int = 1024
     references: int = 6
+    objects: int = 48
     proposals: list[str] = field(default_factory=lambda: list(PROPOSALS))
     starts: int = 12
     jointed: int = 4

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from articulate_ssl.discovery.instance_fit import InstanceFit
 from articulate_ssl.discovery.options import DiscoveryOptions
+from articulate_ssl.discovery.similar_clouds import LabelledClouds
 from articulate_ssl.geometry.orientation_range import mean_rotation
 from articulate_ssl.geometry.se3 import invert_se3, se3
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
@@ -36,6 +37,7 @@ class RegisteredShape:
             frame that clouds have in common.
         beside: [n, K, 3] how far parts of each cloud lie beside their slide, in canonical object space, where they may.
         point_part: [n, N] which part every point of the clouds belongs to, where more than the shape says it.
+        labelled: What said it: clouds of whole objects, which stand as canonical object space does.
     """
 
     shape: ArticulatedShape
@@ -46,6 +48,7 @@ class RegisteredShape:
     axes: Tensor | None = None
     beside: Tensor | None = None
     point_part: Tensor | None = None
+    labelled: LabelledClouds | None = None
 
     @staticmethod
     def of(fit: InstanceFit, clouds: Tensor) -> RegisteredShape:
@@ -97,7 +100,7 @@ class RegisteredShape:
         axes = None if self.axes is None else rotation @ self.axes
         beside = None if self.beside is None else self.beside @ rotation.mT
         base = self.base @ invert_se3(turn)
-        return replace(self, shape=self.shape.in_frame(turn), base=base, axes=axes, beside=beside)
+        return replace(self, shape=self.shape.in_frame(turn), base=base, axes=axes, beside=beside, labelled=None)
 
 
 def trimmed_mean(error: Tensor, options: DiscoveryOptions) -> float:

@@ -42,14 +42,17 @@ class Reshaping:
         clouds: [n, P, 3].
 
     Attributes:
-        point_part: [n, P] which part every point belongs to: the nearest of the registered one's, in its proportions.
+        point_part: [n, P] which part every point belongs to: what the registration says, else the nearest of the
+            registered shape's, in its proportions.
     """
 
     def __init__(self, found: RegisteredShape, clouds: Tensor) -> None:
         own = found.axes, found.log_stretch, found.beside
         fit = InstanceFit(found.shape, found.base, found.state, torch.Generator(), *own)
         self._found, self._points, self._joints = found, clouds, fit.instances().joints
-        self.point_part = found.shape.label[nearest_index(clouds, fit.posed())]
+        self.point_part = found.point_part
+        if found.point_part is None:
+            self.point_part = found.shape.label[nearest_index(clouds, fit.posed())]
         self._axes = object_axes(found.shape)
         normals = [Surface.of(cloud).normals for cloud in clouds.double().numpy()]
         self._normals = torch.from_numpy(np.stack(normals)).to(clouds)

@@ -237,7 +237,7 @@ class PoseEstimator:
             if registers and self.view_search.learnt:
                 chosen, other, margin, votes = self._seen(points, num_points)
             elif registers and dense is not None and self.sliding.learnt:
-                chosen, other, margin = self._slid(points, dense, self._candidates(points, num_points, registers))
+                chosen, other, margin, votes = self._slid(points, dense, num_points)
             else:
                 chosen, other, margin = self._best(self._candidates(points, num_points, registers))
             if dense is not None and self.two_ways.learnt:
@@ -304,13 +304,17 @@ class PoseEstimator:
         self,
         points: Tensor,  # [B, N, 3]
         dense: Tensor,  # [B, P, 3]
-        others: Candidates | None = None,
-    ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
-        """The category's shape where the search for sliding parts finds it, its rival, and the margin between them.
+        num_points: int | None = None,
+    ) -> tuple[Hypotheses, Hypotheses, Tensor, Tensor | None]:  # H = 1, H = 1, [B], [B, N, K]
+        """The category's shape where the search for sliding parts finds it, and its rival.
 
-        Which way round clouds are, the search decides. Others that are turned alike compete by their errors.
+        Which way round clouds are, the search decides. With `num_points` the network's hypotheses that are turned
+        alike compete by their errors.
+
+        Returns:
+            Both, the margin between them, and which parts labelled clouds say that points are of, if there are any.
         """
-        shape, base, state, cost = self.sliding.search(self.articulated.category.chain(), dense)
+        shape, base, state, cost, votes = self.sliding.search(self.articulated.category.chain(), dense, points)
         clouds, count = cost.shape
         rows, parts = torch.arange(clouds, device=points.device), shape.points.unflatten(1, (shape.num_parts, -1))
 
@@ -324,10 +328,11 @@ class PoseEstimator:
 
         first, rival = select(torch.zeros_like(rows)), select(torch.ones_like(rows))
         margin = (1 - cost[:, 0] / cost[:, 1]).clamp(0, 1)
-        if others is None:
-            return first, rival, margin
+        if num_points is None:
+            return first, rival, margin, votes
         error = chamfer_l1(points, first.posed()[:, 0].flatten(1, 2), self.observation.bidirectional)
-        return _better(first, error, others, first.base[:, 0, :3, :3]), rival, margin
+        others = self._candidates(points, num_points, registers=True)
+        return _better(first, error, others, first.base[:, 0, :3, :3]), rival, margin, votes
 
     def _seen(
         self,
@@ -414,8 +419,8 @@ class PoseEstimator:
                 found, _, margin, votes = self._seen(points)
                 return self._prediction(found, points, margin, votes)
             if dense is not None and self.sliding.learnt:
-                found, _, margin = self._slid(points, dense)
-                return self._prediction(found, points, margin)
+                found, _, margin, votes = self._slid(points, dense)
+                return self._prediction(found, points, margin, votes)
             low, high = state_range.to(points).unbind(-1)
             middle, side = (low + high) / 2, _SIDE * (high - low)
             sides = torch.cartesian_prod(*torch.stack([middle - side, middle + side], dim=-1)).view(-1, len(middle))

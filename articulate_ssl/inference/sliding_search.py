@@ -3,34 +3,60 @@
 Chests are boxes: every cloud shows its Manhattan frame, but not which of its 24 rotations is upright, and any single
 chest is right about that too rarely. Discovery has settled it for a whole collection (`discovery.synchronization`); so
 a new cloud is turned as it is most like some clouds of those chests, all stretched to one box. That decides: a
-shape that is placed in the cloud by what every offset costs, and stretched, fits about as well upside down.
+shape that is placed in the cloud, and stretched, fits about as well upside down. Where whole objects were discovered,
+clouds of theirs that are most like the new one say which part its points are of, and the shape's parts fill their
+boxes; else parts are placed by what every offset costs.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from articulate_ssl.discovery.distance_field import DistanceFields
+from articulate_ssl.discovery.instance_fit import InstanceFit
 from articulate_ssl.discovery.manhattan_frame import manhattan_frames
+from articulate_ssl.discovery.part_boxes import fit_part_boxes
 from articulate_ssl.discovery.registrar import fit_slides
+from articulate_ssl.discovery.similar_clouds import LabelledClouds
 from articulate_ssl.discovery.synchronization import CAP, NEIGHBOURS, unit_boxes
 from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.screw import PRISMATIC
 from articulate_ssl.geometry.se3 import se3
+from articulate_ssl.ops.few_bytes import from_few_bytes, in_few_bytes
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.joints import Joints
 
 # Of 540 clouds of unseen chests of three sets, the first turn was right for 90 to 96 % by the clouds most alike of 128,
 # for 85 to 92 % by those of 32, and for 80 to 91 % by all 128 (docs/experiments.md, step 98).
 _GALLERY, _GALLERY_POINTS = 128, 512
+_LABELLED_POINTS = 512
 _TURNS = 2  # the likeliest, and its rival
 _FITTED_POINTS = 1024  # of a cloud, to which the shape is fitted
 _PLACED_POINTS = 256  # of the shape, whose offsets are tried
 _CYCLES = 4  # of the descent on every candidate; twice as many on the best
+
+
+class Slid(NamedTuple):
+    """Where the shape is in B clouds, in each of two turns.
+
+    Attributes:
+        shape: Of 2 B candidates, stretched to the clouds' proportions (points [2 B, K M, 3]).
+        base: [B, 2, 4, 4]
+        state: [B, 2, J]
+        cost: [B, 2] how far the clouds of the gallery most alike are.
+        votes: [B, M, K] share of the labelled clouds most alike in which a point is of each part, if there are any.
+    """
+
+    shape: ArticulatedShape
+    base: Tensor
+    state: Tensor
+    cost: Tensor
+    votes: Tensor | None
 
 
 class SlidingSearch(nn.Module):
@@ -41,6 +67,8 @@ class SlidingSearch(nn.Module):
     Attributes:
         gallery: [R, P, 3] training clouds in canonical orientation, stretched to boxes of width one; none before
             anything was learnt.
+        labelled: [r, P, 3] int8, clouds of whole objects in the same boxes, in steps of the lengths `step` [r].
+        part: [r, P] uint8, which part their points are of.
         points: [K, M, 3] the shape in canonical object space, whose axes are the clouds' common frame.
         axis, pivot: [J, 3] its joints; limits: [J, 2] of their states.
     """
@@ -49,6 +77,9 @@ class SlidingSearch(nn.Module):
         super().__init__()
         joints = num_parts - 1
         self.register_buffer("gallery", torch.zeros(0, _GALLERY_POINTS, 3))
+        self.register_buffer("labelled", torch.zeros(0, _LABELLED_POINTS, 3, dtype=torch.int8))
+        self.register_buffer("step", torch.zeros(0))
+        self.register_buffer("part", torch.zeros(0, _LABELLED_POINTS, dtype=torch.uint8))
         self.register_buffer("points", torch.zeros(num_parts, shape_points, 3))
         self.register_buffer("axis", torch.zeros(joints, 3))
         self.register_buffer("pivot", torch.zeros(joints, 3))
@@ -65,11 +96,16 @@ class SlidingSearch(nn.Module):
         limits: Tensor,  # [J, 2]
         clouds: Tensor,  # [n, N, 3] training clouds
         base: Tensor,  # [n, 4, 4] canonical object space -> cloud
+        labelled: LabelledClouds | None = None,
     ) -> None:
-        """Keep a shape, and some of the clouds it was found in, spread evenly."""
+        """Keep a shape, some of the clouds it was found in, spread evenly, and all whose points have parts."""
         some = torch.linspace(0, len(clouds) - 1, min(len(clouds), _GALLERY)).round().long()
         boxes, _, _ = unit_boxes(clouds[some] @ base[some, :3, :3])
-        self.gallery = boxes[:, :_GALLERY_POINTS].contiguous()
+        self.gallery = boxes[:, :_GALLERY_POINTS].to(self.gallery, copy=True)
+        if labelled is not None:
+            rounded, step = in_few_bytes(labelled.points[:, :_LABELLED_POINTS])
+            self.labelled, self.step = rounded.to(self.labelled), step.to(self.step)
+            self.part = labelled.part[:, :_LABELLED_POINTS].to(self.part)
         self.points.copy_(shape.points.view_as(self.points))
         self.axis.copy_(shape.joints.axis)
         self.pivot.copy_(shape.joints.pivot)
@@ -101,26 +137,40 @@ class SlidingSearch(nn.Module):
         self,
         chain: KinematicChain,
         clouds: Tensor,  # [B, N, 3] with all their points
-    ) -> tuple[ArticulatedShape, Tensor, Tensor, Tensor]:
-        """The shape in every cloud, in each of two turns, the likelier first.
-
-        Returns:
-            The shapes of 2 B candidates, stretched to the clouds' proportions (points [2 B, K M, 3]), their base poses
-            [B, 2, 4, 4] and joint states [B, 2, J], and how far the clouds of the gallery most alike are [B, 2].
-        """
-        device, clouds = clouds.device, clouds.cpu().clone()  # a normal tensor, also where it was none
+        points: Tensor,  # [B, M, 3] of the same clouds, whose parts are asked for
+    ) -> Slid:
+        """The shape in every cloud, in each of two turns, the likelier first."""
+        device, clouds, points = clouds.device, clouds.cpu().clone(), points.cpu().clone()  # no inference tensors
         turn, cost = self.turns(clouds)
-        copies = torch.einsum("bcij,bnj->bcni", turn, clouds[:, :_FITTED_POINTS]).flatten(0, 1)
-        axes = torch.eye(3).to(clouds).expand(len(self.points), 3, 3)
-        generator = torch.Generator().manual_seed(0)
-        fit = fit_slides(self._shape(chain), axes, copies, _PLACED_POINTS, _CYCLES, generator)
+        copies = torch.einsum("bcij,bnj->bcni", turn, clouds).flatten(0, 1)
+        fit, votes = self._fitted(self._shape(chain), copies, torch.einsum("bij,bmj->bmi", turn[:, 0], points))
         back = se3(turn.mT, turn.new_zeros(*turn.shape[:2], 3))
         base, state = (value.unflatten(0, turn.shape[:2]).to(device) for value in (fit.base, fit.state))
         found = fit.instances()
         joints = found.joints
         lines = {name: getattr(joints, name).to(device) for name in ("axis", "pivot", "limits")}
         found = ArticulatedShape(found.points.to(device), found.label.to(device), replace(joints, **lines))
-        return found, back.to(device) @ base, state, cost.to(device)
+        votes = None if votes is None else votes.to(device)
+        return Slid(found, back.to(device) @ base, state, cost.to(device), votes)
+
+    def _fitted(
+        self,
+        shape: ArticulatedShape,
+        clouds: Tensor,  # [2 B, N, 3] turned
+        points: Tensor,  # [B, M, 3] in the likelier turn
+    ) -> tuple[InstanceFit, Tensor | None]:
+        """The shape in the clouds, and which parts points are of, if similar clouds say it."""
+        if not len(self.labelled):
+            axes = torch.eye(3).to(clouds).expand(len(self.points), 3, 3)
+            generator, few = torch.Generator().manual_seed(0), clouds[:, :_FITTED_POINTS].contiguous()
+            return fit_slides(shape, axes, few, _PLACED_POINTS, _CYCLES, generator), None
+        labelled = LabelledClouds(from_few_bytes(self.labelled.cpu(), self.step.cpu()), self.part.cpu())
+        boxes, center, width = unit_boxes(clouds)
+        few = boxes[:, :_FITTED_POINTS]
+        part = labelled.votes(few, shape.num_parts).argmax(dim=-1)
+        asked = (points - center[::_TURNS, None]) / width[::_TURNS, None]
+        votes = labelled.votes(few[::_TURNS], shape.num_parts, asked)
+        return fit_part_boxes(shape, clouds[:, :_FITTED_POINTS], part), votes
 
     def _shape(self, chain: KinematicChain) -> ArticulatedShape:
         points, axis, pivot, limits = (value.cpu() for value in (self.points, self.axis, self.pivot, self.limits))
@@ -128,8 +178,8 @@ class SlidingSearch(nn.Module):
         return ArticulatedShape(points.flatten(0, 1), label, Joints(chain, axis, pivot, PRISMATIC, limits))
 
     def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
-        """The gallery has any size; weights from before there was a search have none."""
-        for name, value in self.named_buffers():
-            state_dict.setdefault(prefix + name, value.clone())
-        self.gallery = torch.empty_like(state_dict[prefix + "gallery"])
+        """Galleries have any size; weights from before there was a search have none."""
+        for name, own in list(self.named_buffers()):
+            value = state_dict.setdefault(prefix + name, own.clone())
+            setattr(self, name, torch.empty_like(value, dtype=own.dtype, device=own.device))
         super()._load_from_state_dict(state_dict, prefix, *rest)

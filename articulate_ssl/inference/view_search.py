@@ -20,6 +20,7 @@ from articulate_ssl.discovery.registration import register_rigid
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.inference.candidates import rivals
 from articulate_ssl.ops.chamfer import nearest_distance, nearest_index
+from articulate_ssl.ops.few_bytes import from_few_bytes, in_few_bytes
 
 # Views that are kept, and points of each. Four times as many were as right, and took twice as long.
 _VIEWS, _POINTS = 1000, 256
@@ -27,7 +28,6 @@ _COMPARED = 128  # points of each by which all are compared with a cloud
 _NEAREST = 30  # views that are registered to the cloud
 _SCALES, _ROUNDS = (0.08, 0.03), 6  # of that registration
 _VOTING = 5  # of those, with the least errors, that say which parts points are of
-_STEPS = 127  # in which the largest coordinate of a view is kept; errors are a tenth of the points' spacing
 _BUFFERS = ("views", "step", "part", "base", "state")
 
 
@@ -52,8 +52,7 @@ class ViewSearch(nn.Module):
     """Poses, joint states and parts of the simulated views that a depth view is most like.
 
     Attributes:
-        views: [V, P, 3] int8, simulated, in steps of length `step`; none before anything was learnt.
-        step: [V]
+        views: [V, P, 3] int8, simulated, in steps of the lengths `step` [V]; none before anything was learnt.
         part: [V, P] uint8, which part their points are of.
         base: [V, 4, 4] canonical object space -> view.
         state: [V, J] joint states.
@@ -82,9 +81,8 @@ class ViewSearch(nn.Module):
     ) -> None:
         """Keep some of these views, spread evenly."""
         some = torch.linspace(0, len(views) - 1, min(len(views), _VIEWS)).round().long()
-        views = views[some, :_POINTS]
-        step = views.abs().amax(dim=(1, 2)) / _STEPS
-        self.views = (views / step[:, None, None]).round().to(self.views)
+        views, step = in_few_bytes(views[some, :_POINTS])
+        self.views = views.to(self.views)
         self.part = part[some, :_POINTS].to(self.part, copy=True)
         self.step, self.base, self.state = (value.to(self.base, copy=True) for value in (step, base[some], state[some]))
 
@@ -95,7 +93,7 @@ class ViewSearch(nn.Module):
     ) -> Seen:
         """Compare with all views, register those that are most alike, and ask the best of these."""
         views, step, base, state = (value.to(points) for value in (self.views, self.step, self.base, self.state))
-        views = views * step[:, None, None]
+        views = from_few_bytes(views, step)
         thin, still = views[:, :_COMPARED].contiguous(), torch.eye(3).to(points)[None]
         found, states, errors, votes = [], [], [], []
         for cloud in points:

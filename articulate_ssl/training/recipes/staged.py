@@ -20,10 +20,12 @@ from torch import Tensor
 from articulate_ssl.discovery.discover import discover
 from articulate_ssl.discovery.from_scans import discover_from_scans
 from articulate_ssl.discovery.grouped import discover_grouped
+from articulate_ssl.discovery.one_object.find import MIN_CLOUDS
 from articulate_ssl.discovery.parallel_axes import with_parallel_axes
 from articulate_ssl.discovery.proposals import load_proposals
 from articulate_ssl.discovery.registered_shape import RegisteredShape
 from articulate_ssl.geometry.rotation_group import rotation_group
+from articulate_ssl.geometry.screw import PRISMATIC
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
 from articulate_ssl.inference.candidates import Iteration
 from articulate_ssl.losses.objective import PoseTarget, staged_terms
@@ -104,24 +106,28 @@ class TrainingRecipe(Recipe):
             registered.state,
             registered.log_stretch,
             found.limits(),
-            registered.point_part,
+            None if registered.point_part is None else registered.point_part[:, :num_points],
         )
         network.category.adopt(found.shape)
         if self._simulated:
             self.estimator.view_search.learn(clouds, registered.base, registered.state, registered.point_part)
         if found.axes is not None and not self._simulated:  # in a frame that the clouds share
             shape = network.category.articulated_shape(network.joint_type)
-            self.estimator.sliding.learn(shape, found.limits(), clouds[kept], registered.base)
+            self.estimator.sliding.learn(shape, found.limits(), clouds[kept], registered.base, found.labelled)
 
     def _discovered(self, data: TrainingClouds, num_points: int) -> tuple[Tensor, RegisteredShape]:
         """Training clouds [n, N, 3], or views that were simulated, and the category's shape registered to them."""
         options, network, observation = self.discovery, self.estimator.articulated, self.estimator.observation
         clouds, category = data.clouds(options.clouds), (network.num_parts, network.joint_type, options)
+        if options.grouped:
+            # Where parts slide, more objects are looked at.
+            whole = options.objects * MIN_CLOUDS if network.joint_type == PRISMATIC else 0
+            objects = data.objects(max(options.clouds, whole))
         if self._simulated:
-            scans = data.scans(options.clouds), *data.objects(options.clouds)
+            scans = data.scans(options.clouds), *objects
             return discover_from_scans(clouds, *scans, *category, observation.orientation, num_points)
         if options.grouped:
-            return clouds, discover_grouped(clouds, *data.objects(options.clouds), *category)
+            return clouds, discover_grouped(clouds, *objects, *category)
         return clouds, discover(clouds, *category, observation)
 
     def step(self, points: Tensor, step: int, generator: Callable[[], torch.Generator]) -> Outcome:

@@ -17,6 +17,7 @@ from articulate_ssl.discovery.one_object.template import as_template
 from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.discovery.registered_shape import RegisteredShape
 from articulate_ssl.discovery.registrar import SearchingRegistrar
+from articulate_ssl.ops.chamfer import nearest_index
 
 SMALL = DiscoveryOptions(search_clouds=4, points=128, dense_points=256, references=1, cycles=3, grouped=True)
 TWO = replace(SMALL, references=2)
@@ -62,8 +63,9 @@ class World:
         base[:, :3, 3] *= size
         state = state * size if self.design is DRAWER else state
         shape = replace(self.shape, points=self.shape.points.double() * size, joints=joints)
-        share = torch.zeros(len(rows), 4, num_parts).double()
-        return OneObject(shape, base, state, share[..., 0].long(), share, share[..., 0])
+        label = shape.label[nearest_index(points.double(), shape.posed(base, state))]
+        share = torch.nn.functional.one_hot(label, num_parts).double()
+        return OneObject(shape, base, state, label, share, torch.zeros_like(share[..., 0]))
 
 
 @pytest.mark.parametrize(

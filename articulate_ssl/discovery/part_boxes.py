@@ -1,0 +1,65 @@
+"""Where a shape's parts are in clouds whose points have parts: every part fills the box of its points.
+
+Parts that slide keep their orientation, so boxes along the axes of a common frame say all: how far a part is stretched,
+where it lies beside its slide, and how far it has slid. Nothing descends.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from articulate_ssl.discovery.instance_fit import InstanceFit
+from articulate_ssl.geometry.se3 import se3
+from articulate_ssl.shape.articulated_shape import MIN_POINTS, ArticulatedShape
+from articulate_ssl.shape.stretch import hinged, stretch_matrices
+
+_OUTSIDE = 0.03  # share of a part's points that may lie outside of its box, at either end: labels are not exact
+
+
+def fit_part_boxes(
+    shape: ArticulatedShape,  # whose parts slide along an axis of the frame
+    clouds: Tensor,  # [n, N, 3] in a frame common to them and the shape
+    part: Tensor,  # [n, N] of their points
+) -> InstanceFit:
+    """The shape in every cloud, stretched; a part with too few points stays where the shape has it, as large."""
+    generator = torch.Generator()  # of points that nothing draws
+    axes = torch.eye(3).to(clouds).expand(shape.num_parts, 3, 3)
+    low, high, seen = _boxes(clouds, part, shape.num_parts)
+    own_low, own_high, _ = _boxes(shape.points[None], shape.label[None], shape.num_parts)
+    own_center = (own_low + own_high)[0] / 2
+    ratio = torch.where(seen[..., None], (high - low).clamp(min=1e-6) / (own_high - own_low).clamp(min=1e-6), 1.0)
+    still = torch.eye(4).to(clouds).expand(len(clouds), 4, 4)
+    state = clouds.new_zeros(len(clouds), len(shape.joints.chain.child))
+    # Stretches are bounded; the places of parts follow from what is left of them.
+    log_stretch = InstanceFit(shape, still, state, generator, axes, ratio.log()).log_stretch
+    chain, root = shape.joints.chain, shape.joints.chain.root
+    rest, _ = hinged(stretch_matrices(axes, log_stretch), shape.part(root).mean(dim=0), shape.joints)
+    at_rest = torch.einsum("nkij,kj->nki", rest.linear, own_center) + rest.shift  # [n, K, 3]
+    moved = torch.where(seen[..., None], (low + high) / 2 - at_rest, 0.0)
+    shift = moved[:, root]
+    children, axis = list(chain.child), shape.joints.axis
+    beside = torch.where(seen[:, children, None], moved[:, children] - shift[:, None], 0.0)
+    along = (beside * axis).sum(dim=-1)
+    all_beside = clouds.new_zeros(len(clouds), shape.num_parts, 3)
+    all_beside[:, children] = beside - along[..., None] * axis
+    base = se3(torch.eye(3).to(clouds).expand(len(clouds), 3, 3), shift)
+    return InstanceFit(shape, base, shape.joints.clamped(along), generator, axes, log_stretch, all_beside)
+
+
+def _boxes(
+    clouds: Tensor,  # [n, N, 3]
+    part: Tensor,  # [n, N]
+    num_parts: int,
+) -> tuple[Tensor, Tensor, Tensor]:  # [n, K, 3], [n, K, 3], [n, K] whether there are points enough
+    """Lowest and highest corner of every part."""
+    low, high = (clouds.new_zeros(len(clouds), num_parts, 3) for _ in range(2))
+    seen = torch.zeros(len(clouds), num_parts, dtype=torch.bool, device=clouds.device)
+    limits = torch.tensor([_OUTSIDE, 1 - _OUTSIDE]).to(clouds)
+    for i, (cloud, label) in enumerate(zip(clouds, part, strict=True)):
+        for k in range(num_parts):
+            mine = cloud[label == k]
+            if len(mine) >= MIN_POINTS:
+                low[i, k], high[i, k] = torch.quantile(mine, limits, dim=0)
+                seen[i, k] = True
+    return low, high, seen

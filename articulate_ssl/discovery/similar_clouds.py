@@ -1,0 +1,49 @@
+"""Which part a point is of, as in labelled clouds of other objects that its own is most like.
+
+No one chest has its drawers where another has them, so one template says badly which drawer a point is of, however it
+is stretched. Clouds of many chests say it well: labelled truly, by those of 120 objects, unseen chests had an mIoU of
+85 %; by those of 15 objects 73 %, and 72 % with the labels that these objects' own clouds say; by the best single
+template 51 % (docs/experiments.md, step 100).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+from articulate_ssl.discovery.synchronization import CAP, NEIGHBOURS
+from articulate_ssl.ops.chamfer import nearest_distance, nearest_index
+
+_COMPARED = 256  # points of each by which clouds are compared
+
+
+class LabelledClouds(NamedTuple):
+    """Clouds of several objects that stand alike, stretched to unit boxes (`synchronization.unit_boxes`).
+
+    Attributes:
+        points: [r, P, 3] farthest-point order.
+        part: [r, P] which part every point belongs to.
+    """
+
+    points: Tensor
+    part: Tensor
+
+    def votes(
+        self,
+        boxes: Tensor,  # [n, N, 3] clouds that stand as these do, in unit boxes, farthest-point order
+        num_parts: int,
+        points: Tensor | None = None,  # [n, M, 3] that are asked for, in the same boxes; those of the clouds by default
+    ) -> Tensor:  # [n, M, K]
+        """Share of the clouds most like each in which the nearest point is of each part."""
+        points = boxes if points is None else points
+        return torch.stack([self._votes(box, asked, num_parts) for box, asked in zip(boxes, points, strict=True)])
+
+    def _votes(self, box: Tensor, points: Tensor, num_parts: int) -> Tensor:
+        thin, copies = self.points[:, :_COMPARED].contiguous(), box[:_COMPARED].expand(len(self.points), -1, -1)
+        there, back = (nearest_distance(*both).clamp(max=CAP) for both in ((copies, thin), (thin, copies)))
+        alike = (there.mean(dim=1) + back.mean(dim=1)).topk(min(NEIGHBOURS, len(thin)), largest=False).indices
+        nearest = nearest_index(points.expand(len(alike), -1, -1).contiguous(), self.points[alike].contiguous())
+        return one_hot(self.part[alike].long().gather(1, nearest), num_parts).to(box).mean(dim=0)
