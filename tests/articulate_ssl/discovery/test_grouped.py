@@ -17,6 +17,7 @@ from articulate_ssl.discovery.one_object.template import as_template
 from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.discovery.registered_shape import RegisteredShape
 from articulate_ssl.discovery.registrar import SearchingRegistrar
+from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.ops.chamfer import nearest_index
 
 SMALL = DiscoveryOptions(search_clouds=4, points=128, dense_points=256, references=1, cycles=3, grouped=True)
@@ -174,3 +175,26 @@ def test_of_many_clouds_of_an_object_some_are_looked_at(monkeypatch, no_registra
     monkeypatch.setattr(grouped, "find_one_object", world.found)
     discover_grouped(world.points, world.points, world.instance, 2, LAPTOP[4], SMALL)
     assert len(world.asked[0].unique()) == MOST_CLOUDS
+
+
+def test_clouds_of_what_slides_are_labelled_by_all_objects(monkeypatch):
+    """In the numbers of the template that stays, also where objects number their parts otherwise."""
+    with_coarse_slides(monkeypatch)
+    world = World(DRAWER, points=1024)
+
+    def found(points, *rest):
+        one = world.found(points, *rest)
+        if len(world.asked) == 1:
+            return one
+        chain = KinematicChain(2, 1, (1,), (0,))
+        shape = replace(one.shape, label=1 - one.shape.label, joints=replace(one.shape.joints, chain=chain))
+        return replace(one, shape=shape, label=1 - one.label, probability=one.probability.flip(-1))
+
+    monkeypatch.setattr(grouped, "find_one_object", found)
+    result = discover_grouped(world.points, world.points, world.instance, 2, DRAWER[4], replace(SMALL, objects=2))
+    assert len(world.asked) == 2 and result.labelled.points.shape == (16, 1024, 3)
+    truth = world.part.expand(16, -1)
+    root = result.shape.joints.chain.root
+    for part in (result.point_part, result.labelled.part):
+        assert ((part != root).long() == truth).float().mean() > 0.9
+    assert result.turned(torch.eye(3)).labelled is None  # they stand as canonical space did

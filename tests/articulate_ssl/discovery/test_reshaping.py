@@ -104,3 +104,12 @@ def test_points_of_what_lies_beside_its_slide_are_told_by_where_it_lies():
     part = Reshaping(found, points).point_part
     assert (part == moved.label).all()
     assert (Reshaping(replace(found, beside=None), points).point_part == moved.label).double().mean() < 0.98
+
+
+def test_parts_that_are_known_are_what_moves():
+    points, found = _registered(DRAWER)
+    state = found.state + 0.2
+    known = Reshaping(replace(found, point_part=found.shape.label.expand(COUNT, -1)), points)
+    still = Reshaping(replace(found, point_part=torch.zeros(COUNT, 300, dtype=torch.int64)), points)
+    torch.testing.assert_close(known.at(torch.zeros(COUNT, 3), state).points, found.shape.posed(found.base, state))
+    torch.testing.assert_close(still.at(torch.zeros(COUNT, 3), state).points, points)

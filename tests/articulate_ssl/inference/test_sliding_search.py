@@ -6,6 +6,8 @@ import torch
 from articulated_objects import Clouds, clouds
 
 from articulate_ssl.discovery.registration import chamfer_l1
+from articulate_ssl.discovery.similar_clouds import LabelledClouds
+from articulate_ssl.discovery.synchronization import unit_boxes
 from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.geometry.screw import PRISMATIC
 from articulate_ssl.geometry.se3 import se3, transform_points
@@ -149,3 +151,43 @@ def test_the_search_competes_with_the_network(learnt):
     assert (found.margin < 1).all() and (found.margin > 0).all()
     unread = estimator.predict(points, 256)
     torch.testing.assert_close(unread.reconstruction_error, without.reconstruction_error)
+
+
+@pytest.fixture(scope="module")
+def labelled(learnt):
+    """A search that has learnt from eight clouds whose points have parts, too."""
+    data = _chests(8, seed=0)
+    boxes, _, _ = unit_boxes(transform_points(torch.linalg.inv(data.base), data.points))
+    search = SlidingSearch(3, 200)
+    search.learn(_shape(data), LIMITS, data.points, data.base, LabelledClouds(boxes, data.part.expand(8, -1)))
+    return search
+
+
+def test_labelled_clouds_say_parts_and_where_they_are(labelled):
+    data = _chests(4, seed=1)
+    _, base, state, _, votes = labelled.search(CHAIN, data.points, data.points[:, :100])
+    assert votes.shape == (4, 100, 3)
+    assert (votes.argmax(dim=-1) == data.part[:100]).float().mean() > 0.85
+    assert roma.rotmat_geodesic_distance(base[:, 0, :3, :3], data.base[:, :3, :3]).rad2deg().max() < 5
+    assert (state[:, 0] - data.state).abs().median() < 0.02
+
+
+def test_labels_are_saved_and_decide_which_part_points_are_of(labelled):
+    data = _chests(2, seed=4)
+    swapped = SlidingSearch(3, 200)
+    # Files of weights give all numbers as float32.
+    saved = {
+        name: value.float() if value.is_floating_point() else value for name, value in labelled.state_dict().items()
+    }
+    swapped.load_state_dict(saved)
+    assert swapped.labelled.dtype == torch.int8 and torch.equal(swapped.part, labelled.part)
+    swapped.part = torch.tensor([0, 2, 1], dtype=torch.uint8)[swapped.part.long()]
+    estimator, points = _estimator(data), data.points[:, :256]
+    parts = []
+    for search in (labelled, swapped):
+        estimator.sliding.load_state_dict(search.state_dict())
+        with torch.inference_mode():  # as a trainer tests
+            parts.append(estimator.predict(points.clone(), 256, dense=data.points.clone()).part_id)
+    assert (parts[0] == data.part[:256]).float().mean() > 0.85
+    other = torch.tensor([0, 2, 1])[parts[1]]
+    assert (other == data.part[:256]).float().mean() > 0.85

@@ -1,0 +1,72 @@
+"""Parts fill the boxes of their points: stretches, places and offsets are read off."""
+
+import torch
+from articulated_objects import clouds, true_shape
+
+from articulate_ssl.discovery.instance_fit import InstanceFit
+from articulate_ssl.discovery.part_boxes import fit_part_boxes
+from articulate_ssl.geometry.screw import PRISMATIC
+
+CHEST = (
+    [((-0.4, 0, 0), (0.4, 0.6, 0.02)), ((0.02, 0.05, 0.1), (0.41, 0.55, 0.2)), ((0.02, 0.05, 0.25), (0.41, 0.55, 0.5))],
+    (0, 0),
+    [((1, 0, 0), (0, 0, 0)), ((1, 0, 0), (0, 0, 0))],
+    [(-0.15, 0.15), (-0.15, 0.15)],
+    PRISMATIC,
+)
+
+
+def _drawn(count: int = 5):
+    """A shape, and what the instance fit makes of it with drawn parameters: the clouds, their parts, the fit."""
+    data = clouds(CHEST, count=count, points=1500, rotate=False)
+    shape = true_shape(CHEST, data).with_centred_pivots()
+    generator = torch.Generator().manual_seed(0)
+
+    def draw(*size: int) -> torch.Tensor:
+        return 2 * torch.rand(size, generator=generator) - 1
+
+    base = torch.eye(4).repeat(count, 1, 1)
+    base[:, :3, 3] = 0.3 * draw(count, 3)
+    beside = 0.1 * draw(count, 3, 3)
+    beside[:, 0], beside[..., 0] = 0, 0
+    axes = torch.eye(3).expand(3, 3, 3)
+    fit = InstanceFit(shape, base, 0.15 * draw(count, 2), generator, axes, 0.25 * draw(count, 3, 3), beside)
+    return shape, fit.posed(), shape.label.expand(count, -1), fit
+
+
+def test_what_was_drawn_is_read_off():
+    shape, points, part, truth = _drawn()
+    found = fit_part_boxes(shape, points, part)
+    torch.testing.assert_close(found.posed(), points, atol=1e-3, rtol=0)
+    torch.testing.assert_close(found.state, truth.state, atol=1e-3, rtol=0)
+    torch.testing.assert_close(found.base, truth.base, atol=1e-3, rtol=0)
+    torch.testing.assert_close(found.log_stretch, truth.log_stretch, atol=1e-3, rtol=0)
+    torch.testing.assert_close(found.beside, truth.beside, atol=1e-3, rtol=0)
+
+
+def test_some_wrong_labels_do_little():
+    shape, points, part, truth = _drawn()
+    wrong = torch.rand(part.shape, generator=torch.Generator().manual_seed(1)) < 0.02
+    found = fit_part_boxes(shape, points, torch.where(wrong, (part + 1) % 3, part))
+    assert (found.state - truth.state).abs().median() < 0.02
+    assert (fit_part_boxes(shape, points, (part + 1) % 3).state - truth.state).abs().median() > 0.02
+
+
+def test_a_part_without_points_stays_where_the_shape_has_it():
+    shape, points, part, _ = _drawn()
+    found = fit_part_boxes(shape, points, torch.where(part == 2, 0, part))
+    assert found.posed().isfinite().all()
+    assert (found.state[:, 1] == 0).all() and (found.beside[:, 2] == 0).all() and (found.log_stretch[:, 2] == 0).all()
+
+
+def test_stretches_are_bounded_and_parts_stay_at_their_centres():
+    shape, points, part, _ = _drawn(1)
+    found = fit_part_boxes(shape, 3 * points, part)
+    assert float(found.log_stretch.max()) < 0.36
+    for k in range(3):
+        boxes = (
+            torch.quantile(some[0][part[0] == k], torch.tensor([0.03, 0.97]), dim=0)
+            for some in (found.posed(), 3 * points)
+        )
+        middle, truth = (box.mean(dim=0) for box in boxes)
+        torch.testing.assert_close(middle, truth, atol=1e-2, rtol=0)
