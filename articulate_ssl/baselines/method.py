@@ -101,9 +101,13 @@ class Method(LightningModule):
     def predict(self, batch: dict[str, Tensor]) -> Prediction:
         """Of B test clouds, of which it reads `points` [B, N, 3] and what `given` names for the test."""
 
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """What the optimiser moves; a group may have a first learning rate `lr` of its own."""
+        return [{"params": list(self.parameters())}]
+
     def configure_optimizers(self) -> dict[str, Any]:
         """Adam, its rate along half a cosine."""
-        optimizer = torch.optim.Adam(self.parameters(), lr=self.effort.learning_rate)
+        optimizer = torch.optim.Adam(self.parameter_groups(), lr=self.effort.learning_rate)
         steps = max(1, self.effort.steps)
         scheduler = torch.optim.lr_scheduler.LambdaLR(
             optimizer, lambda step: 0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * min(step / steps, 1)))

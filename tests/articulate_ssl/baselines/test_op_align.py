@@ -20,6 +20,7 @@ from articulate_ssl.baselines.op_align.alignment import (
     side_alignments,
 )
 from articulate_ssl.baselines.op_align.objective import (
+    Weights,
     coincide,
     density_aware,
     far_pivots,
@@ -106,6 +107,34 @@ def test_part_losses_teach_parts_and_states():
     copies, _ = part_copies(points, side_alignments(replace(seen, state=state), canonical, REVOLUTE))
     part_reconstruction(copies, shape, seen.probability, canonical.probability).backward()
     assert state.grad[0, 0, 1] > 1e-3
+
+
+@problems
+def test_a_pivot_off_the_object_stays_where_parts_fit(num_parts, joint_type):
+    shape, points, seen, canonical, _, _ = articulated_star(num_parts, joint_type)
+    nearest = torch.cdist(seen.pivot, points).argmin(dim=-1)[0]
+    towards = normalize(points[:, nearest] - seen.pivot, dim=-1)
+    distance = torch.linspace(0, 0.2, 41, dtype=torch.float64)
+    weights = Weights()
+
+    def loss(moved):
+        guess = replace(seen, pivot=seen.pivot + moved * towards)
+        copies, _ = part_copies(points, side_alignments(guess, canonical, joint_type))
+        fit = part_reconstruction(copies, shape, guess.probability, canonical.probability)
+        return weights.reconstruction * fit + weights.pivot * far_pivots(guess.pivot, points)
+
+    assert far_pivots(seen.pivot, points) > 0.1  # of pivots that are off the object
+    assert distance[torch.stack([loss(moved) for moved in distance]).argmin()] < 0.01
+
+
+def test_the_base_shape_learns_faster_than_the_networks():
+    method = tiny_method()
+    base = method.object_level.base_shape
+    groups = method.configure_optimizers()["optimizer"].param_groups
+    rates = {parameter: group["initial_lr"] for group in groups for parameter in group["params"]}
+    assert rates.keys() == set(method.parameters())
+    assert {rate for parameter, rate in rates.items() if parameter is not base} == {method.effort.learning_rate}
+    assert rates[base] == pytest.approx(10 * method.effort.learning_rate)
 
 
 def test_density_aware_distance_equals_its_readable_twin():
