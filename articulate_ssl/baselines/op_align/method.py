@@ -20,8 +20,8 @@ Where the paper leaves something open, or its authors' published code does anoth
   steps at the networks' rate and 33 at ten times it (one run each, pivots' weight 0.1).
 - In any orientation it still fails from a cold start: trained alone, the object level ended in a Y that is the union of
   laptops of which the less open ones are turned over, and no joint explains the difference. It looks like a local
-  optimum: weights learnt on clouds turned by at most 20 degrees stayed right when trained on in any orientation, but for
-  base and lid, which a Y of two like plates cannot tell apart (one run each: docs/experiments.md, step 101).
+  optimum: weights learnt on clouds turned by at most 20 degrees stayed right when trained on in any orientation, but
+  for base and lid, which a Y of two like plates cannot tell apart (one run each: docs/experiments.md, step 101).
 - The floor under parts' shares holds for inputs, too, and states begin near zero: else one part soon owns every point.
 - Where objects are known to be turned within a range only, anchors outside of it cannot win: every method may know.
 - Taken from the code: the part terms' growing share (`SHARE_HALVINGS`), the joint directions of Y being alike, Y being
