@@ -41,9 +41,10 @@ def pairwise_costs(
     group: RotationGroup,
 ) -> Tensor:  # [n, n, G]
     """Capped Chamfer distance between cloud i and cloud j turned by each element."""
-    fields = DistanceFields.of(clouds)
     turned = torch.einsum("gij,npj->ngpi", group.elements.to(clouds), clouds[:, :_POINTS])
-    one_sided = torch.stack([fields.at(i, turned).clamp(max=CAP).mean(dim=-1) for i in range(len(clouds))])
+    # One field at a time: those of some hundred clouds are gigabytes.
+    fields = (DistanceFields.of(cloud[None]) for cloud in clouds)
+    one_sided = torch.stack([field.at(0, turned).clamp(max=CAP).mean(dim=-1) for field in fields])
     return one_sided + one_sided.transpose(0, 1)[..., group.inverse]
 
 
