@@ -5,7 +5,8 @@
    cloud in the part frames of the last winner (paper, Sec. 3.1).
 3. *Registration* at test time: the leading hypotheses' predicted shapes are registered to the cloud without leaving
    their joints, and the best reconstruction wins.
-   Where parts slide, the category's own shape is looked for, too, in the frame of the cloud (`sliding_search`).
+   Where parts slide, clouds of other objects that are most like it decide which way round it is; where these are
+   labelled, they say which parts points are of, and where the category's shape is (`sliding_search`).
    Where simulated views taught, those that a view is most like decide which way round it is, and say with the
    posed shape which parts points are of (`view_search`).
 4. *Decision*, where a category's clouds can be explained in two ways that fit alike: the relief of all points decides
@@ -49,8 +50,8 @@ from articulate_ssl.ops.kd_tree import kd_tree
 from articulate_ssl.shape.observation import FAR, Observation
 from articulate_ssl.shape.stretch import principal_directions
 
-# Weight of what similar views say about the part of a point, beside the posed shape: of 80 development views each the
-# mIoU is 90, 91 and 47 (safes, washing machines, chests) by three quarters, 90, 89 and 44 by a half, 90, 81 and 35 by
+# Weight of what similar views, or clouds, say about the part of a point, beside the posed shape: of 80 development
+# views each the mIoU is 90, 91 and 47 (safes, washing machines, chests) by three quarters, 90, 89 and 44 by a half, 90, 81 and 35 by
 # nothing (docs/experiments.md, step 99).
 _VIEWS_SAY = 0.75
 _SIDE = 1 / 3  # of the width of a joint's range, from its middle, where a search without a network starts, too
