@@ -51,8 +51,8 @@ from articulate_ssl.shape.observation import FAR, Observation
 from articulate_ssl.shape.stretch import principal_directions
 
 # Weight of what similar views, or clouds, say about the part of a point, beside the posed shape: of 80 development
-# views each the mIoU is 90, 91 and 47 (safes, washing machines, chests) by three quarters, 90, 89 and 44 by a half, 90, 81 and 35 by
-# nothing (docs/experiments.md, step 99).
+# views each the mIoU is 90, 91 and 47 (safes, washing machines, chests) by three quarters, 90, 89 and 44 by a half, 90,
+# 81 and 35 by nothing (docs/experiments.md, step 99).
 _VIEWS_SAY = 0.75
 _SIDE = 1 / 3  # of the width of a joint's range, from its middle, where a search without a network starts, too
 
