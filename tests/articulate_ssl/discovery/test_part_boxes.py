@@ -1,19 +1,10 @@
 """Parts fill the boxes of their points: stretches, places and offsets are read off."""
 
 import torch
-from articulated_objects import clouds, true_shape
+from articulated_objects import CHEST, clouds, true_shape
 
 from articulate_ssl.discovery.instance_fit import InstanceFit
 from articulate_ssl.discovery.part_boxes import fit_part_boxes
-from articulate_ssl.geometry.screw import PRISMATIC
-
-CHEST = (
-    [((-0.4, 0, 0), (0.4, 0.6, 0.02)), ((0.02, 0.05, 0.1), (0.41, 0.55, 0.2)), ((0.02, 0.05, 0.25), (0.41, 0.55, 0.5))],
-    (0, 0),
-    [((1, 0, 0), (0, 0, 0)), ((1, 0, 0), (0, 0, 0))],
-    [(-0.15, 0.15), (-0.15, 0.15)],
-    PRISMATIC,
-)
 
 
 def _drawn(count: int = 5):

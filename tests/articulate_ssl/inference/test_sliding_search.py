@@ -3,7 +3,7 @@
 import pytest
 import roma
 import torch
-from articulated_objects import Clouds, clouds
+from articulated_objects import CHEST, Clouds, clouds
 
 from articulate_ssl.discovery.registration import chamfer_l1
 from articulate_ssl.discovery.similar_clouds import LabelledClouds
@@ -20,14 +20,6 @@ from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.joints import Joints
 from articulate_ssl.shape.observation import Observation
 
-# A floor with two drawers of different height above its front half, which slide along x.
-CHEST = (
-    [((-0.4, 0, 0), (0.4, 0.6, 0.02)), ((0.02, 0.05, 0.1), (0.41, 0.55, 0.2)), ((0.02, 0.05, 0.25), (0.41, 0.55, 0.5))],
-    (0, 0),
-    [((1, 0, 0), (0, 0, 0)), ((1, 0, 0), (0, 0, 0))],
-    [(-0.15, 0.15), (-0.15, 0.15)],
-    PRISMATIC,
-)
 CHAIN = KinematicChain(3, 0, (0, 0), (1, 2))
 LIMITS = torch.tensor([[-0.2, 0.2], [-0.2, 0.2]])
 
