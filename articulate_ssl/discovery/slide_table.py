@@ -164,11 +164,13 @@ def place(
     shape: ArticulatedShape,
     clouds: Tensor,  # [n, N, 3] in the shape's canonical frame, but for translation, depth and width
     num_points: int,
+    fields: DistanceFields | None = None,  # of the clouds standing for the direction of the slide, if known
 ) -> Placement:
     """Read off where a shape's parts are: each where it fits best, and with one of them where it fits second best."""
     direction, chain = Direction.of(shape.joints.axis[0]), shape.joints.chain
     own, standing = Standing.of(shape.points[None], direction), Standing.of(clouds, direction)
-    depth, offset = _best_offsets(shape, own.points[0], standing, direction, num_points)  # [n], [n, C, K]
+    fields = DistanceFields.of(standing.points) if fields is None else fields
+    depth, offset = _best_offsets(shape, own.points[0], fields, direction, num_points)  # [n], [n, C, K]
     unit = standing.width[:, direction.axis]
     state = (offset[..., list(chain.child)] - offset[..., [chain.root]]) * unit[:, None, None]
     ratio = standing.width / own.width
@@ -185,13 +187,13 @@ def place(
 
 
 def _best_offsets(
-    shape: ArticulatedShape, template: Tensor, standing: Standing, direction: Direction, num_points: int
+    shape: ArticulatedShape, template: Tensor, fields: DistanceFields, direction: Direction, num_points: int
 ) -> tuple[Tensor, Tensor]:
     """Depth [n] and offsets [n, 1 + K, K]: the best of all parts, and the best of all but one."""
     thin = torch.linspace(0, len(template) - 1, min(len(template), num_points)).round().long()
     member = one_hot(shape.label[thin], shape.num_parts).to(template)
-    fields, depths, offsets = DistanceFields.of(standing.points), [], []
-    for cloud in range(len(standing.points)):
+    depths, offsets = [], []
+    for cloud in range(len(fields.values)):
         table = offset_costs(template[thin], fields, cloud, direction)
         cost = (member.T @ table.flatten(1)).unflatten(1, table.shape[1:])  # [K, depths, offsets]
         depth = cost.amin(dim=-1).sum(dim=0).argmin()

@@ -41,7 +41,7 @@ def _propose(scene: Scene, direction: Direction) -> Split | None:
     if slides is None:
         return None
     shape = _star(template, slides, direction, float(own.width[0, direction.axis]))
-    base, state, log_stretch = (value[:, 0] for value in place(shape, scene.aligned, options.points))
+    base, state, log_stretch = (value[:, 0] for value in place(shape, scene.aligned, options.points, fields))
     error = torch.full((len(base),), slides.cost).to(template)
     axes = torch.eye(3).to(template).expand(scene.num_parts, 3, 3)
     return Split(slides.label, refined=False, registered=RegisteredShape(shape, base, state, log_stretch, error, axes))
