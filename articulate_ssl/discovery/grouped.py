@@ -107,7 +107,8 @@ def discover_grouped(
     given = slice(len(clouds))
     if collection.frame is None:
         candidates = [
-            collection.registrar.register(template.shape, collection.few) for template in _understood(templates)
+            collection.registrar.register(template.shape, collection.few)
+            for template in _understood(templates)[: options.references]
         ]
         best = min(candidates, key=lambda candidate: trimmed_mean(candidate.error, options))
         found = collection.registrar.register(best, collection.clouds).of_clouds(given)
