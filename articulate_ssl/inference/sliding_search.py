@@ -2,10 +2,11 @@
 
 Chests are boxes: every cloud shows its Manhattan frame, but not which of its 24 rotations is upright, and any single
 chest is right about that too rarely. Discovery has settled it for a whole collection (`discovery.synchronization`); so
-a new cloud is turned as it is most like some clouds of those chests, all stretched to one box. That decides: a
-shape that is placed in the cloud, and stretched, fits about as well upside down. Where whole objects were discovered,
-clouds of theirs that are most like the new one say which part its points are of, and the shape's parts fill their
-boxes; else parts are placed by what every offset costs.
+a new cloud is turned as it is most like some clouds of those chests, or copies of them in other proportions, all
+stretched to one box. That decides: a shape that is placed in the cloud, and stretched, fits about as well upside down.
+Where whole objects were discovered, clouds of theirs that are most like the new one, or copies in other proportions and
+joint states, say which part its points are of, and the shape's parts fill their boxes; else parts are placed by what
+every offset costs.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from articulate_ssl.discovery.part_boxes import fit_part_boxes
 from articulate_ssl.discovery.registrar import fit_slides
 from articulate_ssl.discovery.similar_clouds import LabelledClouds
 from articulate_ssl.discovery.synchronization import CAP, NEIGHBOURS, unit_boxes
+from articulate_ssl.discovery.varied_clouds import in_other_proportions, varied
 from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.screw import PRISMATIC
@@ -34,7 +36,9 @@ from articulate_ssl.shape.joints import Joints
 # Of 540 clouds of unseen chests of three sets, the first turn was right for 90 to 96 % by the clouds most alike of 128,
 # for 85 to 92 % by those of 32, and for 80 to 91 % by all 128 (docs/experiments.md, step 98).
 _GALLERY, _GALLERY_POINTS = 128, 512
+_TURNED_POINTS = 128  # of each that are looked up in all rotations; twice as many were as right
 _LABELLED_POINTS = 512
+_PROPORTIONS = 4  # copies of every cloud by which turns are decided: wrong 9 % without, 6 % with 4 or 8
 _TURNS = 2  # the likeliest, and its rival
 _FITTED_POINTS = 1024  # of a cloud, to which the shape is fitted
 _PLACED_POINTS = 256  # of the shape, whose offsets are tried
@@ -76,6 +80,7 @@ class SlidingSearch(nn.Module):
     def __init__(self, num_parts: int, shape_points: int) -> None:
         super().__init__()
         joints = num_parts - 1
+        self._copies: tuple[Tensor | None, LabelledClouds | None] = None, None  # of the clouds `labelled`
         self.register_buffer("gallery", torch.zeros(0, _GALLERY_POINTS, 3))
         self.register_buffer("labelled", torch.zeros(0, _LABELLED_POINTS, 3, dtype=torch.int8))
         self.register_buffer("step", torch.zeros(0))
@@ -120,12 +125,14 @@ class SlidingSearch(nn.Module):
         rotation, _ = manhattan_frames(clouds, torch.Generator().manual_seed(0))
         boxes, _, _ = unit_boxes(clouds @ rotation.mT)
         group = rotation_group(24).elements.to(clouds)
+        gallery = self.gallery[:, :_TURNED_POINTS].cpu()
+        gallery = in_other_proportions(gallery, _PROPORTIONS, torch.Generator().manual_seed(0))
         # What is g @ box in canonical orientation lies in the box where the inverse of g puts it.
-        turned = torch.einsum("gji,rpj->grpi", group, self.gallery.cpu())
+        turned = torch.einsum("gji,rpj->grpi", group, gallery)
         found, costs = [], []
         for box, frame in zip(boxes, rotation, strict=True):
             cost = DistanceFields.of(box[None]).at(0, turned).clamp(max=CAP).mean(dim=2)  # [G, R]
-            alike = cost.topk(min(NEIGHBOURS, len(self.gallery)), dim=1, largest=False).values
+            alike = cost.topk(min(NEIGHBOURS, len(gallery)), dim=1, largest=False).values
             least = alike.mean(dim=1).topk(_TURNS, largest=False)
             found.append(group[least.indices] @ frame)
             costs.append(least.values)
@@ -143,7 +150,8 @@ class SlidingSearch(nn.Module):
         device, clouds, points = clouds.device, clouds.cpu().clone(), points.cpu().clone()  # no inference tensors
         turn, cost = self.turns(clouds)
         copies = torch.einsum("bcij,bnj->bcni", turn, clouds).flatten(0, 1)
-        fit, votes = self._fitted(self._shape(chain), copies, torch.einsum("bij,bmj->bmi", turn[:, 0], points))
+        points = torch.einsum("bcij,bmj->bcmi", turn, points).flatten(0, 1)
+        fit, votes = self._fitted(self._shape(chain), copies, points)
         back = se3(turn.mT, turn.new_zeros(*turn.shape[:2], 3))
         base, state = (value.unflatten(0, turn.shape[:2]).to(device) for value in (fit.base, fit.state))
         found = fit.instances()
@@ -157,20 +165,29 @@ class SlidingSearch(nn.Module):
         self,
         shape: ArticulatedShape,
         clouds: Tensor,  # [2 B, N, 3] turned
-        points: Tensor,  # [B, M, 3] in the likelier turn
+        points: Tensor,  # [2 B, M, 3] turned alike
     ) -> tuple[InstanceFit, Tensor | None]:
-        """The shape in the clouds, and which parts points are of, if similar clouds say it."""
+        """The shape in the clouds, and which parts points are of in the likelier turn, if similar clouds say it."""
         if not len(self.labelled):
             axes = torch.eye(3).to(clouds).expand(len(self.points), 3, 3)
             generator, few = torch.Generator().manual_seed(0), clouds[:, :_FITTED_POINTS].contiguous()
             return fit_slides(shape, axes, few, _PLACED_POINTS, _CYCLES, generator), None
-        labelled = LabelledClouds(from_few_bytes(self.labelled.cpu(), self.step.cpu()), self.part.cpu())
         boxes, center, width = unit_boxes(clouds)
         few = boxes[:, :_FITTED_POINTS]
-        part = labelled.votes(few, shape.num_parts).argmax(dim=-1)
-        asked = (points - center[::_TURNS, None]) / width[::_TURNS, None]
-        votes = labelled.votes(few[::_TURNS], shape.num_parts, asked)
-        return fit_part_boxes(shape, clouds[:, :_FITTED_POINTS], part), votes
+        asked = (points - center[:, None]) / width[:, None]
+        votes = self._varied(shape.joints).votes(few, shape.num_parts, torch.cat([few, asked], dim=1))
+        of_cloud, of_points = votes.split([few.shape[1], points.shape[1]], dim=1)
+        fit = fit_part_boxes(shape, clouds[:, :_FITTED_POINTS], of_cloud.argmax(dim=-1))
+        return fit, of_points[::_TURNS]
+
+    def _varied(self, joints: Joints) -> LabelledClouds:
+        """The labelled clouds and copies of them, made when they are first asked for."""
+        of, found = self._copies
+        if of is not self.labelled:
+            labelled = LabelledClouds(from_few_bytes(self.labelled.cpu(), self.step.cpu()), self.part.cpu())
+            found = varied(labelled, joints, torch.Generator().manual_seed(0))
+            self._copies = self.labelled, found
+        return found
 
     def _shape(self, chain: KinematicChain) -> ArticulatedShape:
         points, axis, pivot, limits = (value.cpu() for value in (self.points, self.axis, self.pivot, self.limits))
