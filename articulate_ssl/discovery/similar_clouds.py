@@ -15,10 +15,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
+from articulate_ssl.discovery.distance_field import DistanceFields
 from articulate_ssl.discovery.synchronization import CAP
 from articulate_ssl.ops.chamfer import nearest_distance, nearest_index
 
-_COMPARED = 256  # points of each by which clouds are compared; screening all by 64 first cost 2 points of mIoU
+# Points of each whose distances to a cloud say which clouds are compared with it at all, and how many are. By as many
+# points on both sides instead of the cloud's distance field, 2 points of mIoU were lost; so none is.
+_SCREENED, _SCREENS = 64, 512
+_COMPARED = 256  # points of each by which clouds are compared
 _VOTING = 32  # at most, and at most every fourth: of 3,944 clouds 8 and 16 were worse, 64 as good
 
 
@@ -44,8 +48,11 @@ class LabelledClouds(NamedTuple):
         return torch.stack([self._votes(box, asked, num_parts) for box, asked in zip(boxes, points, strict=True)])
 
     def _votes(self, box: Tensor, points: Tensor, num_parts: int) -> Tensor:
-        thin, copies = self.points[:, :_COMPARED].contiguous(), box[:_COMPARED].expand(len(self.points), -1, -1)
+        far = DistanceFields.of(box[None]).at(0, self.points[:, :_SCREENED]).clamp(max=CAP).mean(dim=1)
+        near = far.topk(min(_SCREENS, len(far)), largest=False).indices
+        thin, copies = self.points[near, :_COMPARED], box[:_COMPARED].expand(len(near), -1, -1)
         there, back = (nearest_distance(*both).clamp(max=CAP) for both in ((copies, thin), (thin, copies)))
-        alike = (there.mean(dim=1) + back.mean(dim=1)).topk(min(_VOTING, -(-len(thin) // 4)), largest=False).indices
+        voting = min(_VOTING, -(-len(far) // 4))
+        alike = near[(there.mean(dim=1) + back.mean(dim=1)).topk(voting, largest=False).indices]
         nearest = nearest_index(points.expand(len(alike), -1, -1).contiguous(), self.points[alike].contiguous())
         return one_hot(self.part[alike].long().gather(1, nearest), num_parts).to(box).mean(dim=0)
