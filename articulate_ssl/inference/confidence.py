@@ -19,6 +19,7 @@ _QUANTILES = 101  # of the training clouds' errors: percentiles
 # Of the squared weights. Where nearly all clouds agree, the few others must not make the regression certain; one pair
 # of clouds' worth of doubt. Chosen, not tuned.
 _RIDGE = 0.5
+_TINY = 1e-3  # of a margin: where all are the same, it says nothing
 
 
 def relative_error(
@@ -60,6 +61,9 @@ class Confidence(nn.Module):
             raise ValueError("confidence is learnt from one cloud or more, all predicted with finite errors")
         self.quantiles.copy_(torch.quantile(error, torch.linspace(0, 1, _QUANTILES).to(error)))
         features = self._features(margin, error).double().cpu().numpy()
+        # Margins of some searches span tenths, of others hundredths: the ridge is to hold down neither more.
+        spread = max(features[:, 1].std(), _TINY)
+        features[:, 1] /= spread
         sign = np.where(agrees.cpu().numpy(), 1.0, -1.0)
 
         def loss(weights: np.ndarray) -> tuple[float, np.ndarray]:
@@ -67,7 +71,8 @@ class Confidence(nn.Module):
             value = np.logaddexp(0, -score).sum() + _RIDGE * weights @ weights
             return value, -(sign * expit(-score)) @ features + 2 * _RIDGE * weights
 
-        self.weights.copy_(torch.from_numpy(minimize(loss, np.zeros(3), jac=True).x))
+        found = minimize(loss, np.zeros(3), jac=True).x
+        self.weights.copy_(torch.from_numpy(found / [1, spread, 1]))
         self.learnt.fill_(True)
 
     def probability(self, margin: Tensor, error: Tensor) -> Tensor:  # [B]

@@ -1,4 +1,4 @@
-"""Copies of clouds in other proportions and joint states keep what belongs together, and label what they have not seen."""
+"""Copies of clouds in other proportions and joint states keep what belongs together, and label what is unseen."""
 
 import torch
 from articulated_objects import clouds

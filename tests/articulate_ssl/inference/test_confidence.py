@@ -36,6 +36,13 @@ def test_a_clear_margin_is_more_probable_and_a_bad_fit_less():
     assert bad < low < clear
 
 
+def test_margins_of_hundredths_say_as_much_as_margins_of_tenths():
+    error, margin, agrees = _clouds()
+    confidence = Confidence()
+    confidence.learn(error, margin / 100, agrees)
+    torch.testing.assert_close(confidence.probability(margin / 100, error), _learnt().probability(margin, error))
+
+
 def test_where_all_agree_nothing_is_certain_and_a_margin_counts_for_little():
     error, margin, agrees = _clouds()
     confidence = Confidence()
