@@ -18,8 +18,10 @@ from articulate_ssl.discovery.grouped import discover_grouped
 from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.discovery.registered_shape import RegisteredShape
 from articulate_ssl.discovery.simulated_views import simulate_views
+from articulate_ssl.discovery.synchronization import standing_margins, unit_boxes
 from articulate_ssl.discovery.view_orientations import find_view_orientations
 from articulate_ssl.geometry.orientation_range import OrientationRange
+from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.ops.denormals import flush_denormals
 from articulate_ssl.ops.progress import Stage, announce
 
@@ -50,7 +52,7 @@ def discover_from_scans(
         DiscoveryError: if parts are not found (`discover_grouped`).
     """
     found = discover_grouped(clouds, scans, instance, num_parts, joint_type, options)
-    kept = found.error.argsort()[: options.kept(len(clouds))]
+    kept = _likeliest(found, clouds)[: options.kept(len(clouds))]
     found, clouds = found.of_clouds(kept), clouds[kept]
     random, generator = np.random.default_rng(options.seed), torch.Generator().manual_seed(options.seed)
     mean_distance = float((views - views.mean(dim=1, keepdim=True)).norm(dim=-1).mean())
@@ -66,6 +68,18 @@ def discover_from_scans(
     simulated = simulate_views(found, clouds, turns, num_points, mean_distance, random, reshape=True)
     _announce(2, "done")
     return simulated
+
+
+def _likeliest(found: RegisteredShape, clouds: Tensor) -> Tensor:  # [n]
+    """Clouds [n, N, 3] in the order in which their poses are to be believed.
+
+    A chest that is turned over fits about as well. Views of such clouds say of all others, too, that they are turned
+    otherwise: with 12 % of them, how chests stand before a camera was found 99 degrees off, without any 12.
+    """
+    if found.axes is None:  # nothing stands in a common frame
+        return found.error.argsort()
+    boxes, _, _ = unit_boxes(clouds @ found.base[:, :3, :3] @ found.axes[0])
+    return standing_margins(boxes, rotation_group(24)).argsort(descending=True)
 
 
 def _announce(done: int, name: str) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import roma
 import torch
-from articulated_objects import LAPTOP, clouds, true_shape
+from articulated_objects import CHEST, LAPTOP, clouds, true_shape
 
 from articulate_ssl.discovery import from_scans, reshaping
 from articulate_ssl.discovery.from_scans import discover_from_scans
@@ -48,3 +48,16 @@ def test_views_that_teach_are_turned_as_the_views_are(monkeypatch, degrees):
     turn, _ = roma.rigid_points_registration(truth.shape.points, found.shape.points / found.shape.points.norm())
     expected = upright if orientation.limited else torch.eye(3)
     assert roma.rotmat_geodesic_distance(turn, expected).rad2deg() < (25 if orientation.limited else 0.1)
+
+
+def test_chests_that_are_turned_over_are_believed_last():
+    data = clouds(CHEST, count=12, points=1024, resample=True)
+    base, over = data.base.clone(), roma.rotvec_to_rotmat(torch.tensor([torch.pi, 0.0, 0.0]))
+    base[[2, 9], :3, :3] = base[[2, 9], :3, :3] @ over
+    axes, stretch = torch.eye(3).expand(3, 3, 3), torch.zeros(12, 3, 3)
+    # They fit best, which is not to be what they are believed by.
+    error = torch.ones(12).scatter(0, torch.tensor([2, 9]), 0.5)
+    found = RegisteredShape(true_shape(CHEST, data), base, data.state, stretch, error, axes)
+    assert sorted(from_scans._likeliest(found, data.points)[-2:].tolist()) == [2, 9]
+    alone = RegisteredShape(true_shape(CHEST, data), base, data.state, stretch, error)
+    assert sorted(from_scans._likeliest(alone, data.points)[:2].tolist()) == [2, 9]

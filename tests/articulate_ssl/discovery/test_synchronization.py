@@ -3,7 +3,13 @@
 import pytest
 import torch
 
-from articulate_ssl.discovery.synchronization import pairwise_costs, synchronise, total_cost, unit_boxes
+from articulate_ssl.discovery.synchronization import (
+    pairwise_costs,
+    standing_margins,
+    synchronise,
+    total_cost,
+    unit_boxes,
+)
 from articulate_ssl.geometry.rotation_group import rotation_group
 
 
@@ -68,3 +74,14 @@ def test_a_turned_cloud_costs_least_under_the_rotation_that_undoes_it():
     # Cloud j turned by a_i a_j^{-1} is cloud i.
     assert torch.equal(costs.argmin(dim=-1), group.product[elements][:, group.inverse[elements]])
     torch.testing.assert_close(costs, costs.transpose(0, 1)[..., group.inverse])
+
+
+def test_clouds_that_stand_otherwise_have_the_smallest_margins():
+    group, generator = rotation_group(24), torch.Generator().manual_seed(0)
+    points = torch.rand(12, 900, 3, generator=generator) - 0.5
+    shapes = torch.stack([cloud[(cloud.prod(dim=1) > 0) | (cloud[:, 0] > 0.2)][:400] for cloud in points])
+    shapes[3] = shapes[3] @ group.elements[5].float()
+    shapes[7] = shapes[7] @ group.elements[17].float()
+    margins = standing_margins(unit_boxes(shapes)[0], group)
+    assert sorted(margins.argsort()[:2].tolist()) == [3, 7]
+    assert margins[[3, 7]].max() < -0.1 and margins.sort().values[2] > -0.05
