@@ -35,8 +35,7 @@ from articulate_ssl.shape.joints import Joints
 
 # Of 540 clouds of unseen chests of three sets, the first turn was right for 90 to 96 % by the clouds most alike of 128,
 # for 85 to 92 % by those of 32, and for 80 to 91 % by all 128 (docs/experiments.md, step 98).
-_GALLERY, _GALLERY_POINTS = 128, 512
-_TURNED_POINTS = 128  # of each that are looked up in all rotations; twice as many were as right
+_GALLERY, _GALLERY_POINTS = 128, 128  # clouds, and points of each; twice as many points were as right
 _LABELLED_POINTS = 512
 _PROPORTIONS = 4  # copies of every cloud by which turns are decided: wrong 9 % without, 6 % with 4 or 8
 _TURNS = 2  # the likeliest, and its rival
@@ -125,7 +124,7 @@ class SlidingSearch(nn.Module):
         rotation, _ = manhattan_frames(clouds, torch.Generator().manual_seed(0))
         boxes, _, _ = unit_boxes(clouds @ rotation.mT)
         group = rotation_group(24).elements.to(clouds)
-        gallery = self.gallery[:, :_TURNED_POINTS].cpu()
+        gallery = self.gallery[:, :_GALLERY_POINTS].cpu()  # older weights keep more
         gallery = in_other_proportions(gallery, _PROPORTIONS, torch.Generator().manual_seed(0))
         # What is g @ box in canonical orientation lies in the box where the inverse of g puts it.
         turned = torch.einsum("gji,rpj->grpi", group, gallery)
