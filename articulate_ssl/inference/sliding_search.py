@@ -124,8 +124,7 @@ class SlidingSearch(nn.Module):
         rotation, _ = manhattan_frames(clouds, torch.Generator().manual_seed(0))
         boxes, _, _ = unit_boxes(clouds @ rotation.mT)
         group = rotation_group(24).elements.to(clouds)
-        gallery = self.gallery[:, :_GALLERY_POINTS].cpu()  # older weights keep more
-        gallery = in_other_proportions(gallery, _PROPORTIONS, torch.Generator().manual_seed(0))
+        gallery = in_other_proportions(self.gallery.cpu(), _PROPORTIONS, torch.Generator().manual_seed(0))
         # What is g @ box in canonical orientation lies in the box where the inverse of g puts it.
         turned = torch.einsum("gji,rpj->grpi", group, gallery)
         found, costs = [], []

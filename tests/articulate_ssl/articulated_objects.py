@@ -70,6 +70,17 @@ GLASSES = (
 )
 
 
+def chest_of_height(height: float, limit: float = 0.3):
+    """A floor with two drawers above it, of which the lower one ends at that height."""
+    return (
+        [((0, 0, 0), (0.6, 0.6, 0.02)), ((0, 0, 0.05), (0.6, 0.6, height)), ((0, 0, height + 0.03), (0.6, 0.6, 0.6))],
+        (0, 0),
+        [((1, 0, 0), (0, 0, 0)), ((1, 0, 0), (0, 0, 0))],
+        [(0, limit), (0, limit)],
+        PRISMATIC,
+    )
+
+
 def clouds(
     design=LAPTOP,
     count: int = 6,

@@ -1,28 +1,16 @@
 """Clouds that are most like a cloud say which part its points are of."""
 
 import torch
-from articulated_objects import clouds
+from articulated_objects import chest_of_height, clouds
 
 from articulate_ssl.discovery.similar_clouds import LabelledClouds
 from articulate_ssl.discovery.synchronization import unit_boxes
-from articulate_ssl.geometry.screw import PRISMATIC
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
-
-
-def _chest(height: float):
-    """A floor with two drawers above it, of which the lower one ends at that height."""
-    return (
-        [((0, 0, 0), (0.6, 0.6, 0.02)), ((0, 0, 0.05), (0.6, 0.6, height)), ((0, 0, height + 0.03), (0.6, 0.6, 0.6))],
-        (0, 0),
-        [((1, 0, 0), (0, 0, 0)), ((1, 0, 0), (0, 0, 0))],
-        [(0, 0.3), (0, 0.3)],
-        PRISMATIC,
-    )
 
 
 def _standing(height: float, count: int, seed: int):
     """Unit boxes [n, 768, 3] of such chests, and which part their points are of."""
-    data = clouds(_chest(height), count=count, points=768, resample=True, seed=seed)
+    data = clouds(chest_of_height(height), count=count, points=768, resample=True, seed=seed)
     return unit_boxes(transform_points(invert_se3(data.base), data.points))[0], data.part.expand(count, -1)
 
 

@@ -1,7 +1,7 @@
 """Copies of clouds in other proportions and joint states keep what belongs together, and label what is unseen."""
 
 import torch
-from articulated_objects import clouds
+from articulated_objects import chest_of_height, clouds
 
 from articulate_ssl.discovery.similar_clouds import LabelledClouds
 from articulate_ssl.discovery.synchronization import unit_boxes
@@ -12,19 +12,8 @@ from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.shape.joints import Joints
 
 
-def _chest(height: float, limit: float = 0.3):
-    """A floor with two drawers above it, of which the lower one ends at that height."""
-    return (
-        [((0, 0, 0), (0.6, 0.6, 0.02)), ((0, 0, 0.05), (0.6, 0.6, height)), ((0, 0, height + 0.03), (0.6, 0.6, 0.6))],
-        (0, 0),
-        [((1, 0, 0), (0, 0, 0)), ((1, 0, 0), (0, 0, 0))],
-        [(0, limit), (0, limit)],
-        PRISMATIC,
-    )
-
-
 def _standing(height: float, seed: int, limit: float = 0.3):
-    data = clouds(_chest(height, limit), count=4, points=512, resample=True, seed=seed)
+    data = clouds(chest_of_height(height, limit), count=4, points=512, resample=True, seed=seed)
     boxes, _, _ = unit_boxes(transform_points(invert_se3(data.base), data.points))
     joints = Joints(KinematicChain(3, 0, (0, 0), (1, 2)), data.axis, data.pivot, PRISMATIC)
     return LabelledClouds(boxes, data.part.expand(4, -1)), joints
