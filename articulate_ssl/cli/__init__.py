@@ -10,6 +10,8 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 
+from articulate_ssl.ops.idle_threads import sleep_soon
+
 BAD_INPUT = 2  # the exit code
 # Modules are imported only to run them, because the training code takes long to import.
 COMMANDS = {
@@ -24,6 +26,7 @@ OTHERWISE = "articulate_ssl.cli.learn"
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command and return its exit code: 0, or 2 for bad arguments or bad input (one message, no traceback)."""
+    sleep_soon()
     from articulate_ssl.ops.denormals import flush_denormals
 
     arguments = sys.argv[1:] if arguments is None else list(arguments)

@@ -15,6 +15,7 @@ from articulate_ssl.comparison.results import collect
 from articulate_ssl.comparison.rows import learners, rows_of
 from articulate_ssl.comparison.spread import do_jobs
 from articulate_ssl.comparison.table import as_csv, as_json, as_markdown
+from articulate_ssl.ops.idle_threads import sleep_soon
 from articulate_ssl.pretrained.rebuild import CATEGORIES
 from articulate_ssl.pretrained.stages import StageFailed
 from datamodules.atomic import atomic_write
@@ -33,6 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = _parser().parse_args(arguments)
     categories = CATEGORIES if args.categories == [_EVERY] else tuple(args.categories)
     names = tuple(args.methods) or learners()
+    sleep_soon()  # the programs that this one starts
     if args.workers > 1 and args.scheduler is None:
         # Parallelism comes from workers then; programs that share cores by threads slow each other down.
         os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // args.workers)))
