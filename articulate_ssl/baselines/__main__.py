@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from articulate_ssl.baselines import METHODS, method_class
-from articulate_ssl.baselines.method import OCCUPANCY
+from articulate_ssl.baselines.method import OCCUPANCY, Method
 from articulate_ssl.baselines.runner import problem_of, seeded, test, train
 from articulate_ssl.ops.denormals import flush_denormals
 from articulate_ssl.ops.progress import shown
@@ -36,10 +36,24 @@ def _run(args: argparse.Namespace) -> None:
     kind = method_class(args.method)
     if args.view not in kind.views:
         raise ValueError(f"{kind.title} is defined for {' and '.join(kind.views)} clouds, not {args.view}")
-    data = ArticulatedDataModule(
+    data = _data(args, kind, args.root, args.source)
+    method = seeded(kind, problem_of(data, args.orientation_range), args.seed, args.steps)
+    with shown():
+        note = train(method, data, args.out, args.seed)
+        if args.test_source is None:
+            test(method, data, args.out, note["seconds"])
+            return
+        other = _data(args, kind, args.test_root or args.root, args.test_source, str(data.folder))
+        test(method, other, args.out / f"tested-on-{args.test_source}", note["seconds"])
+
+
+def _data(
+    args: argparse.Namespace, kind: type[Method], root: str, source: str, calibration_set: str | None = None
+) -> ArticulatedDataModule:
+    return ArticulatedDataModule(
         args.category,
-        args.root,
-        args.source,
+        root,
+        source,
         args.view,
         args.protocol,
         num_points=args.points,
@@ -48,12 +62,9 @@ def _run(args: argparse.Namespace) -> None:
         val_samples=0,
         max_test_samples=args.samples,
         dense_in_fit=True,
+        calibration_set=calibration_set,
         occupancy=OCCUPANCY in kind.given,
     )
-    method = seeded(kind, problem_of(data, args.orientation_range), args.seed, args.steps)
-    with shown():
-        note = train(method, data, args.out, args.seed)
-        test(method, data, args.out, note["seconds"])
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -67,6 +78,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--category", required=True)
     add("--root", default="data", help="folder that `make data` wrote to")
     add("--source", default="procedural")
+    add("--test-source", help="test on objects of this source instead of the set's own test split")
+    add("--test-root", help="folder of that set; default: --root")
     add("--view", default="complete", choices=VIEWS)
     add("--protocol", choices=PROTOCOLS, help="of partial views; default: honest")
     add("--seed", type=int, default=0, help="of weights, order and rotations")

@@ -52,7 +52,16 @@ def _compare(category: str, names: tuple[str, ...], args: argparse.Namespace) ->
     """One table; whether nothing failed."""
     root = args.root or args.build / "data"
     setting = Setting(
-        category, args.view, args.build, root, args.samples, args.steps, tuple(args.configs), tuple(args.data_options)
+        category,
+        args.view,
+        args.build,
+        root,
+        args.samples,
+        args.steps,
+        tuple(args.configs),
+        tuple(args.data_options),
+        args.test_source,
+        args.test_root,
     )
     try:
         make_data(setting, names, _say)
@@ -91,6 +100,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--methods", nargs="*", default=[], metavar="NAME", help=f"default: {', '.join(learners())}")
     add("--build", type=Path, default=Path("build/compare"), help="of tables and trainings; default: build/compare")
     add("--root", type=Path, help="folder that `make data` wrote to; default: data in --build, made if missing")
+    add("--test-source", help="test on objects of this source instead, which `make data` made a set of (SOURCE)")
+    add("--test-root", type=Path, help="folder of that set (OUT); default: --root")
     add("--samples", type=int, default=SAMPLES, help=f"test clouds; default: {SAMPLES}")
     add("--steps", type=int, help="of each method; default: its own. Recipes have those of their configuration")
     add("--configs", nargs="*", default=[], type=Path, help="configuration files of recipes behind the cpu profile")

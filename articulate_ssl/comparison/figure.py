@@ -62,7 +62,7 @@ def draw(results: Results, path: str | os.PathLike) -> None:
             axes.spines[side].set_visible(False)
     seeds = max((len(result.seeds) for result in results.rows), default=0)
     figure.suptitle(
-        f"{results.setting.category}, {results.setting.view} clouds, by what methods are given\n"
+        f"{results.setting.title}, by what methods are given\n"
         f"{results.samples} clouds of {results.instances} unseen objects, {seeds} seed{'' if seeds == 1 else 's'}, "
         "95 % intervals",
         color=_INK,

@@ -22,13 +22,14 @@ from articulate_ssl.pretrained.pack import PROFILES, VIEW_OF_DATA, fit_command, 
 from articulate_ssl.pretrained.rebuild import COMPLETE_OPTIONS, DEPTH_OPTIONS, resumed
 from articulate_ssl.pretrained.stages import Stage, Workplace
 from articulate_ssl.training.checkpoint import load_module
-from datamodules.manifest import MANIFEST_NAME, Manifest, set_folder
+from datamodules.manifest import MANIFEST_NAME, Manifest, ManifestError, set_folder
 from datamodules.occupancy import FOLDER, INDEX_NAME
 
 DATA_SEED = 21  # no other: shipped weights and their check are of 11 and 12, README's numbers of 1 to 4
 OCCUPANCY_SAMPLES = 2048  # of each training cloud
 # Configuration files of recipes that need their own, behind the category's and the profile.
 RECIPE_CONFIGS = {"paper": (Path("configs/profiles/paper_recipe.yaml"),)}
+_SOURCE = "procedural"  # of the set that trains
 SAMPLES = 300  # test clouds; chosen: Oracle ICP takes two seconds for each
 
 
@@ -45,6 +46,9 @@ class Setting:
         steps: Of each method, in the place of its own; recipes have those of their configuration.
         configs: More configuration files for the recipes, behind the category's and the profile.
         data_options: Words for the generator, if the set does not exist yet.
+        test_source: Where other test objects come from, on which the same trainings are tested, too: a set of that
+            source, category and view, under `test_root`. None stands for the test split of the set of all.
+        test_root: Folder of that set.
     """
 
     category: str
@@ -55,16 +59,45 @@ class Setting:
     steps: int | None = None
     configs: tuple[Path, ...] = ()
     data_options: tuple[str, ...] = ()
+    test_source: str | None = None
+    test_root: Path | None = None
 
     @property
     def name(self) -> str:
         """Of the table's files."""
-        return f"{self.category}-{self.view}"
+        return f"{self._trained_on}-tested-on-{self.test_source}" if self.test_source else self._trained_on
+
+    @property
+    def title(self) -> str:
+        """For people."""
+        tested = f", tested on objects from {self.test_source}" if self.test_source else ""
+        return f"{self.category}, {self.view} clouds{tested}"
 
     @property
     def folder(self) -> Path:
-        """Of the jobs."""
-        return self.build / self.name
+        """Of the jobs: whatever they are tested on, they are trained once."""
+        return self.build / self._trained_on
+
+    @property
+    def protocol(self) -> str | None:
+        """Of partial views."""
+        return "honest" if self.view == "partial" else None
+
+    @property
+    def training_set(self) -> Path:
+        """Folder of the set that trains and calibrates."""
+        return set_folder(self.root, self.category, _SOURCE, self.view, self.protocol)
+
+    @property
+    def test_set(self) -> Path:
+        """Folder of the set that is tested on."""
+        if self.test_source is None:
+            return self.training_set
+        return set_folder(self.test_root or self.root, self.category, self.test_source, self.view, self.protocol)
+
+    @property
+    def _trained_on(self) -> str:
+        return f"{self.category}-{self.view}"
 
     @property
     def orientation_range(self) -> float:
@@ -80,9 +113,14 @@ def make_data(setting: Setting, learners: tuple[str, ...], say: Callable[[str], 
 
     Raises:
         StageFailed: if the generator fails.
+        ManifestError: if other objects are to be tested on and their set is not there: nobody but the user has them.
     """
-    protocol = "honest" if setting.view == "partial" else None
-    folder = set_folder(setting.root, setting.category, "procedural", setting.view, protocol)
+    if not (setting.test_set / MANIFEST_NAME).is_file() and setting.test_source is not None:
+        raise ManifestError(
+            f"{setting.test_set}: no data set here. Make it with: make data CAT={setting.category} VIEW={setting.view} "
+            f"SOURCE={setting.test_source} ROOT=<folder of the objects> OUT={setting.test_root or setting.root}"
+        )
+    folder = setting.training_set
     occupancy = needs_occupancy(learners)
     if (folder / MANIFEST_NAME).is_file():
         if not occupancy or (folder / FOLDER / INDEX_NAME).is_file():
@@ -123,7 +161,7 @@ class Job:
 
     def stages(self) -> tuple[Stage, ...]:
         """The programs, in their order."""
-        return (self._method_stage(),) if self.learner in METHODS else self._recipe_stages()
+        return self._method_stages() if self.learner in METHODS else self._recipe_stages()
 
     def make(self, say: Callable[[str], None] = lambda _line: None) -> None:
         """Do what is not done yet.
@@ -147,10 +185,10 @@ class Job:
     def report(self, column: str | None) -> dict[str, Any]:
         """The content of `metrics.json`, of one column of a recipe's, with `parameters` and `train_seconds`."""
         if column is None:
-            return json.loads((self.work.folder / JSON_NAME).read_text())
-        path = newest_metrics(self._run)
+            return json.loads((self._tested / JSON_NAME).read_text())
+        path = newest_metrics(self._tested if self.setting.test_source else self._run)
         whole = json.loads(path.read_text())
-        fit, _ = self.stages()
+        fit, *_ = self.stages()
         module = load_module(whole["checkpoint"])
         about = {"parameters": sum(p.numel() for p in module.parameters()), "train_seconds": self.work.seconds(fit)}
         about |= {name: whole[name] for name in ("setting",) if name in whole}
@@ -160,13 +198,27 @@ class Job:
     def _run(self) -> Path:
         return self.work.folder / "run"
 
-    def _method_stage(self) -> Stage:
+    @property
+    def _other_test(self) -> str:
+        return f"test-on-{self.setting.test_source}"
+
+    @property
+    def _tested(self) -> Path:
+        """Where the numbers of a method lie (`baselines.__main__`), and of a recipe on other objects than its set's."""
+        source = self.setting.test_source
+        return self.work.folder / f"tested-on-{source}" if source else self.work.folder
+
+    def _method_stages(self) -> tuple[Stage, ...]:
         setting = self.setting
         words = [self.learner, "--category", setting.category, "--view", setting.view, "--root", str(setting.root)]
         words += ["--seed", str(self.seed), "--samples", str(setting.samples)]
         words += ["--orientation-range", str(setting.orientation_range), "--out", str(self.work.folder)]
         words += [] if setting.steps is None else ["--steps", str(setting.steps)]
-        return Stage("method", (sys.executable, "-m", "articulate_ssl.baselines", *words))
+        command = (sys.executable, "-m", "articulate_ssl.baselines", *words)
+        if setting.test_source is None:
+            return (Stage("method", command),)
+        other = ("--test-source", setting.test_source, "--test-root", str(setting.test_root or setting.root))
+        return Stage("method", command), Stage(self._other_test, (*command, *other))
 
     def _recipe_stages(self) -> tuple[Stage, ...]:
         setting = self.setting
@@ -178,4 +230,11 @@ class Job:
         learn += ["--trainer.default_root_dir", str(self._run)]
         ours = (sys.executable, "-m", "articulate_ssl.cli")
         columns = ("--model.inference.columns", "true")
-        return Stage("fit", (*ours, fit, *learn)), Stage("test", (*ours, "test", *learn, *columns))
+        stages = (Stage("fit", (*ours, fit, *learn)), Stage("test", (*ours, "test", *learn, *columns)))
+        if setting.test_source is None:
+            return stages
+        other = ("--data.source", setting.test_source, "--data.root", str(setting.test_root or setting.root))
+        other += ("--data.calibration_set", str(setting.training_set))
+        # The folder of the run stays: the checkpoint is looked up there. What is written goes with the logger.
+        other += ("--trainer.logger", "CSVLogger", "--trainer.logger.save_dir", str(self._tested))
+        return *stages, Stage(self._other_test, (*ours, "test", *learn, *columns, *other))

@@ -114,6 +114,8 @@ def _row_result(row: Row, seeds: tuple[int, ...], reports: list[dict[str, Any]],
 
 def _printed(row: Row, setting: Setting) -> dict[str, Any]:
     """The paper's figures; of our rows, beside the one that does what the paper's own does."""
+    if setting.test_source is not None:  # it prints nothing of other objects than its own
+        return {}
     key, ours = _PAPERS_OWN
     name = key if row.name == ours else row.name if row.column is None else None
     return _paper_tables()[setting.view].get(setting.category, {}).get(name, {})

@@ -47,7 +47,7 @@ def as_markdown(results: Results) -> str:
     """Both tables, with what a reader must know about them."""
     setting = results.setting
     lines = [
-        f"# {setting.category}, {setting.view} clouds",
+        f"# {setting.title}",
         "",
         f"{results.samples} test clouds of {results.instances} objects that no method has seen. Means over seeds and "
         "clouds, and in brackets 95 % intervals over seeds and objects (docs/comparison.md says how they are made); "

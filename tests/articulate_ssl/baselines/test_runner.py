@@ -8,6 +8,7 @@ from synthetic import write_synthetic_set
 from toy_methods import Killed, Shells, problem
 
 from articulate_ssl.baselines import METHODS, method_class, runner
+from articulate_ssl.baselines import __main__ as command
 from articulate_ssl.baselines.method import (
     DENSE_CLOUDS,
     JOINT_LINES,
@@ -19,9 +20,11 @@ from articulate_ssl.baselines.method import (
     Method,
 )
 from articulate_ssl.baselines.runner import SHOWN, problem_of, seeded, seen_in_test, seen_in_training, train
+from articulate_ssl.metrics.calibration import calibrate
 from datamodules.articulated_data_module import ArticulatedDataModule
 
 POINTS = 48
+OTHER = "tested-on-procedural"
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +89,24 @@ def test_the_report_says_what_was_tested(root, tmp_path):
     assert report["train_seconds"] == note["seconds"] and report["seconds_per_cloud"] > 0
     assert report["parameters"] == 12 * 32 + 32 + 32 * 2 + 2
     assert report["samples"] == 16
+
+
+def test_a_training_is_tested_on_objects_from_elsewhere_too(root, tmp_path, monkeypatch):
+    write_synthetic_set(tmp_path / "other", points=POINTS, test_instances=3, seed=9)
+    monkeypatch.setattr(command, "method_class", lambda _name: Shells)
+    options = ["npcs_epn", "--category", "laptop", "--root", str(root), "--points", str(POINTS), "--batch-size", "4"]
+    options += ["--out", str(tmp_path / "out")]
+    assert command.main(options) == 0
+    trained = (tmp_path / "out" / "weights.pt").stat().st_mtime_ns
+    seen = []
+    monkeypatch.setattr(runner, "calibrate", lambda _said, labels: seen.append(labels) or calibrate(_said, labels))
+    assert command.main([*options, "--test-source", "procedural", "--test-root", str(tmp_path / "other")]) == 0
+    assert (tmp_path / "out" / "weights.pt").stat().st_mtime_ns == trained
+    own, other = (json.loads((tmp_path / "out" / place / "metrics.json").read_text()) for place in ("", OTHER))
+    assert (own["instances"], other["instances"]) == (2, 3)
+    assert own["seg_miou"]["mean"] != other["seg_miou"]["mean"]
+    first = next(iter(_data(root).calibration_dataloader()))
+    assert torch.equal(seen[0]["points"][:4], first["points"])  # of the objects that trained
 
 
 def test_methods_see_what_they_are_given_and_nothing_else(root):

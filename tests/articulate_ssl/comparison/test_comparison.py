@@ -49,7 +49,11 @@ class _Programs:
             return 1
         if "articulate_ssl.baselines" in command:
             seed = float(command[command.index("--seed") + 1])
-            (Path(command[command.index("--out") + 1]) / "metrics.json").write_text(json.dumps(_report(seed)))
+            out = Path(command[command.index("--out") + 1])
+            if "--test-source" in command:
+                out, seed = out / f"tested-on-{command[command.index('--test-source') + 1]}", seed + 10
+                out.mkdir(exist_ok=True)
+            (out / "metrics.json").write_text(json.dumps(_report(seed)))
         return 0
 
     @property
@@ -104,6 +108,14 @@ def test_commands_are_those_that_the_programs_take(tmp_path):
     words = " ".join(fit.command)
     assert "-c configs/profiles/cpu.yaml --seed_everything 1 -c more.yaml --model.recipe staged" in words
     assert all(file.is_file() for files in jobs_module.RECIPE_CONFIGS.values() for file in files)
+    other = {"test_source": "shape2motion", "test_root": tmp_path / "mine"}
+    same, method = Job(_setting(tmp_path, **other), "oracle_icp", 2).stages()
+    assert same == Job(_setting(tmp_path), "oracle_icp", 2).stages()[0]
+    args = methods_parser().parse_args(method.command[3:])
+    assert (args.test_source, args.test_root) == ("shape2motion", str(tmp_path / "mine"))
+    *same, other_test = Job(_setting(tmp_path, **other), "staged", 1).stages()
+    assert tuple(same) == Job(_setting(tmp_path), "staged", 1).stages()
+    assert other_test.command[: len(same[1].command)] == same[1].command
     fit, _ = Job(_setting(tmp_path, configs=(Path("more.yaml"),)), "paper", 1).stages()
     assert "-c configs/profiles/paper_recipe.yaml -c more.yaml --model.recipe paper" in " ".join(fit.command)
 
@@ -172,6 +184,25 @@ def test_the_tables_hold_what_the_reports_and_the_paper_say(tmp_path, programs, 
     (row,) = json.loads((build / "laptop-complete.json").read_text())["rows"]
     assert row["printed"]["seg_miou"] == 56.2 and row["parameters"] == 12345
     assert matplotlib.image.imread(build / "laptop-complete.png").std() > 0
+
+
+def test_trainings_are_tested_on_other_objects_too(tmp_path, programs, capsys):
+    for source in ("procedural", "partnet-mobility"):
+        (folder := tmp_path / "data" / "laptop" / f"{source}-complete").mkdir(parents=True)
+        (folder / "manifest.json").touch()
+    build = tmp_path / "build"
+    options = ["--build", str(build), "--root", str(tmp_path / "data"), "--methods", "oracle_icp"]
+    assert command.main(options) == 0
+    assert command.main([*options, "--test-source", "partnet-mobility"]) == 0
+    assert len(programs.commands) == 2  # the training is not repeated
+    row = next(line for line in capsys.readouterr().out.splitlines()[::-1] if line.startswith("| Oracle ICP | c"))
+    assert "| 14.0 [13.0, 15.0] |" in row
+    text = (build / "laptop-complete-tested-on-partnet-mobility.md").read_text()
+    assert text.startswith("# laptop, complete clouds, tested on objects from partnet-mobility\n")
+    assert "43.3" not in text  # the paper's, of its own objects
+    assert "| 4.0 [3.0, 5.0] |" in (build / "laptop-complete.md").read_text()
+    assert command.main([*options, "--test-source", "hoi4d"]) == 2
+    assert "make data CAT=laptop VIEW=complete SOURCE=hoi4d" in capsys.readouterr().err
 
 
 def test_what_is_not_defined_or_not_there_is_a_dash(tmp_path, monkeypatch):
