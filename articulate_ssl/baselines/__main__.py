@@ -37,14 +37,18 @@ def _run(args: argparse.Namespace) -> None:
     if args.view not in kind.views:
         raise ValueError(f"{kind.title} is defined for {' and '.join(kind.views)} clouds, not {args.view}")
     data = _data(args, kind, args.root, args.source)
-    method = seeded(kind, problem_of(data, args.orientation_range), args.seed, args.steps)
+    problem = problem_of(data, args.orientation_range)
+    tested, report = data, args.out
+    if args.test_source is not None:
+        tested = _data(args, kind, args.test_root or args.root, args.test_source, str(data.folder))
+        report = args.out / f"tested-on-{args.test_source}"
+        other = problem_of(tested)
+        if (other.num_parts, other.joint_type) != (problem.num_parts, problem.joint_type):
+            raise ValueError(f"{tested.folder}: has other parts or joints than {data.folder}, which trains")
+    method = seeded(kind, problem, args.seed, args.steps)
     with shown():
         note = train(method, data, args.out, args.seed)
-        if args.test_source is None:
-            test(method, data, args.out, note["seconds"])
-            return
-        other = _data(args, kind, args.test_root or args.root, args.test_source, str(data.folder))
-        test(method, other, args.out / f"tested-on-{args.test_source}", note["seconds"])
+        test(method, tested, report, note["seconds"])
 
 
 def _data(

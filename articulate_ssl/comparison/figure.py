@@ -60,10 +60,11 @@ def draw(results: Results, path: str | os.PathLike) -> None:
         axes.tick_params(axis="y", length=0)
         for side in ("top", "right", "left"):
             axes.spines[side].set_visible(False)
-    seeds = max((len(result.seeds) for result in results.rows), default=0)
+    counts = [len(result.seeds) for result in results.rows if result.seeds] or [0]
+    seeds = "1 seed" if set(counts) == {1} else f"{'up to ' * (min(counts) < max(counts))}{max(counts)} seeds"
     figure.suptitle(
         f"{results.setting.title}, by what methods are given\n"
-        f"{results.samples} clouds of {results.instances} unseen objects, {seeds} seed{'' if seeds == 1 else 's'}, "
+        f"{results.samples} clouds of {results.instances} unseen objects, {seeds}, "
         "95 % intervals",
         color=_INK,
         fontsize="medium",

@@ -20,6 +20,7 @@ from articulate_ssl.baselines.method import (
     Method,
 )
 from articulate_ssl.baselines.runner import SHOWN, problem_of, seeded, seen_in_test, seen_in_training, train
+from articulate_ssl.geometry.screw import PRISMATIC
 from articulate_ssl.metrics.calibration import calibrate
 from datamodules.articulated_data_module import ArticulatedDataModule
 
@@ -91,7 +92,7 @@ def test_the_report_says_what_was_tested(root, tmp_path):
     assert report["samples"] == 16
 
 
-def test_a_training_is_tested_on_objects_from_elsewhere_too(root, tmp_path, monkeypatch):
+def test_a_training_is_tested_on_objects_from_elsewhere_too(root, tmp_path, monkeypatch, capsys):
     write_synthetic_set(tmp_path / "other", points=POINTS, test_instances=3, seed=9)
     monkeypatch.setattr(command, "method_class", lambda _name: Shells)
     options = ["npcs_epn", "--category", "laptop", "--root", str(root), "--points", str(POINTS), "--batch-size", "4"]
@@ -107,6 +108,9 @@ def test_a_training_is_tested_on_objects_from_elsewhere_too(root, tmp_path, monk
     assert own["seg_miou"]["mean"] != other["seg_miou"]["mean"]
     first = next(iter(_data(root).calibration_dataloader()))
     assert torch.equal(seen[0]["points"][:4], first["points"])  # of the objects that trained
+    write_synthetic_set(tmp_path / "drawers", points=POINTS, joint_type=PRISMATIC)
+    assert command.main([*options, "--test-source", "procedural", "--test-root", str(tmp_path / "drawers")]) == 2
+    assert "has other parts or joints" in capsys.readouterr().err
 
 
 def test_methods_see_what_they_are_given_and_nothing_else(root):
