@@ -3,11 +3,11 @@
 Li et al. 2020 (ANCSH / NPCS) as the paper runs it (appendix "Implementation details for baselines"): the network also
 selects a discrete rotation mode, with supervision. Two rows of the table are this file with modes and without.
 
-What the paper leaves open is decided here. Modes are turned copies of the cloud (`npcs_network.py`), of which training
-needs a few only: right ones and wrong ones, half of these from where the cloud looks most like itself. The network
-reads spin images and normals that are found in the dense cloud, without which base and lid of a laptop are the same. It
-looks at the leading modes again, in the frames that their residual rotations lead to. Joint lines are said in the
-parent's canonical space, as in ANCSH, and not in that of the mode.
+What the paper leaves open is decided here. Modes are turned copies of the cloud (`surface_network.py`), of which
+training needs a few only: right ones and wrong ones, half of these from where the cloud looks most like itself. The
+network reads spin images and normals that are found in the dense cloud, without which base and lid of a laptop are the
+same. It looks at the leading modes again, in the frames that their residual rotations lead to. Joint lines are said in
+the parent's canonical space, as in ANCSH, and not in that of the mode.
 """
 
 from __future__ import annotations
@@ -22,14 +22,15 @@ from torch import Tensor
 from torch.nn import functional
 
 from articulate_ssl.baselines.method import DENSE_CLOUDS, JOINTS, PART_LABELS, PART_POSES, Effort, Method, Problem
-from articulate_ssl.baselines.npcs_network import MODES, CoordinateNetwork, Geometry, NetworkSize, WholeShape
+from articulate_ssl.baselines.npcs_network import CoordinateNetwork, WholeShape
 from articulate_ssl.baselines.part_coordinates import joint_states, nearest_on_line, ransac_poses
 from articulate_ssl.baselines.perfect_oracle import part_points
-from articulate_ssl.baselines.spin_images import SPIN_CHANNELS, spin_images
 from articulate_ssl.geometry.orientation_range import OrientationRange, mean_rotation
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
 from articulate_ssl.inference.prediction import Prediction
+from articulate_ssl.network.surface_network import MODES, SurfaceCloud, SurfaceSize
+from articulate_ssl.ops.spin_images import SPIN_CHANNELS, spin_images
 from datamodules.articulated_data_module import ArticulatedDataModule
 
 _NEAR_DEG = 10.0  # standard deviation per axis of a frame that was looked at before
@@ -97,10 +98,10 @@ class NPCS(Method):
     labelled_spaces = True
     modes: ClassVar[bool]
 
-    def __init__(self, problem: Problem, size: NetworkSize | None = None) -> None:
+    def __init__(self, problem: Problem, size: SurfaceSize | None = None) -> None:
         """Args: the category; sizes other than the usual ones."""
         super().__init__(problem)
-        self.size = size or NetworkSize()
+        self.size = size or SurfaceSize()
         joints = problem.num_parts - 1
         self.network = CoordinateNetwork(problem.num_parts, self.size)
         self.register_buffer("elements", rotation_group(MODES).elements.float(), persistent=False)
@@ -141,7 +142,7 @@ class NPCS(Method):
             raise ValueError("NPCS learns from part labels: open the data with dense_in_fit=True")
         target = Target.of(batch).leading(self.size.read)
         points = batch["points"][:, : self.size.read]
-        geometry = Geometry.of(points, *self.known_surface(batch), self.size)
+        geometry = SurfaceCloud.of(points, *self.known_surface(batch), self.size)
         if not self.modes:
             frame = torch.eye(3, device=self.device).expand(len(target.pose), 1, 3, 3)
             return self.point_loss(geometry.seen_in(frame), frame, target, points)[0]
@@ -188,7 +189,7 @@ class NPCS(Method):
         near = roma.rotvec_to_rotmat(torch.randn(2, len(root), 3, device=root.device) * _radians(_NEAR_DEG))
         return torch.stack([root @ residual @ near[0], root @ near[1]], dim=1)
 
-    def wrong_frames(self, geometry: Geometry, target: Target) -> Tensor:  # [B, 2, 3, 3]
+    def wrong_frames(self, geometry: SurfaceCloud, target: Target) -> Tensor:  # [B, 2, 3, 3]
         """Frames to be told from the right ones: one in which the cloud looks like itself, and any.
 
         Candidates for the former are turns of a cube from every part's pose, which is where boxes and plates that were
@@ -211,7 +212,7 @@ class NPCS(Method):
         return torch.stack([alike, draws[rows, far]], dim=1)
 
     def point_loss(
-        self, seen: Geometry, frame: Tensor, target: Target, points: Tensor
+        self, seen: SurfaceCloud, frame: Tensor, target: Target, points: Tensor
     ) -> tuple[Tensor, Tensor]:  # [], [B S]
         """Everything but the mode, in right frames [B, S, 3, 3]; and the logits of these."""
         copies = frame.shape[1]
@@ -245,14 +246,14 @@ class NPCS(Method):
     def predict(self, batch: dict[str, Tensor]) -> Prediction:
         """Reads `points` and `dense_points`."""
         points = batch["points"]
-        geometry = Geometry.of(points, *spin_images(points[:, : self.size.read], batch["dense_points"]), self.size)
+        geometry = SurfaceCloud.of(points, *spin_images(points[:, : self.size.read], batch["dense_points"]), self.size)
         frame, margin = self.choose_frames(geometry)
         seen = geometry.seen_in(frame[:, None])
         said = self.network.look(seen)
         logits, coordinates = self.network.coordinates(seen, said)
         return self.assemble(points, logits, coordinates, said, margin)
 
-    def choose_frames(self, geometry: Geometry) -> tuple[Tensor, Tensor]:  # [B, 3, 3], [B]
+    def choose_frames(self, geometry: SurfaceCloud) -> tuple[Tensor, Tensor]:  # [B, 3, 3], [B]
         """The frame in which every cloud is read, and how much better it is than the next that is turned another way.
 
         With modes: the leading ones that are distinct are looked at again in the frame that their residual rotation
@@ -274,7 +275,7 @@ class NPCS(Method):
         margin = (2 * torch.sigmoid(logit[rows, best] - rival) - 1).clamp(0, 1)
         return rotation[rows, best], margin
 
-    def _look_from(self, geometry: Geometry, frame: Tensor) -> tuple[Tensor, Tensor]:  # [B, S], [B, S, 3, 3]
+    def _look_from(self, geometry: SurfaceCloud, frame: Tensor) -> tuple[Tensor, Tensor]:  # [B, S], [B, S, 3, 3]
         """Mode logits in frames [B, S, 3, 3], and the root's rotation as seen from each; too far turned is never."""
         logits, rotations = [], []
         for rows in _chunks(len(frame), max(1, _CHUNK_COPIES // frame.shape[1])):

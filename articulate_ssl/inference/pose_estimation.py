@@ -9,7 +9,7 @@
    labelled, they say which parts points are of, and where the category's shape is (`sliding_search`).
    Where simulated views taught, those that a view is most like decide which way round it is, and say with the
    posed shape which parts points are of (`view_search`).
-4. *Decision*, where a category's clouds can be explained in two ways that fit alike: the relief of all points decides
+4. *Decision*, where a category's clouds can be explained in two ways that fit alike: the relief of the surface decides
    between the winner and its twin (`two_ways`), which is registered, too, if the winner was.
 5. *Hand*, where upright cameras see objects and their mirror images: clouds are explained in a mirror, too, and how
    well either explains them decides (`handedness`).
@@ -253,9 +253,11 @@ class PoseEstimator:
         dense: Tensor,  # [B, P, 3]
         registers: bool,
     ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
-        """Of the two explanations of clouds the one that their relief favours, the other, and by how much."""
-        twin = self._twin(one, points, registers)
-        odds = self.two_ways.log_odds(self._relief(one, dense), self._relief(twin, dense))
+        """Of the two explanations of clouds the one that their surface favours, the other, and by how much."""
+        twin, surface = self._twin(one, points, registers), self.two_ways.surface
+        odds = self.two_ways.relief_odds(self._relief(one, dense), self._relief(twin, dense))
+        if surface is not None:
+            odds = odds + surface.log_odds(_frames(one, twin), dense)
         chosen, other = either(odds < 0, twin, one), either(odds < 0, one, twin)
         return chosen, other, (odds.abs() / 2).tanh()  # how much likelier than not
 
@@ -273,11 +275,14 @@ class PoseEstimator:
         points: Tensor,  # [B, N, 3] normalised, farthest-point order
         num_points: int,
         dense: Sequence[Tensor],  # of [B, P, 3] the same clouds with all their points
-    ) -> list[tuple[Tensor, Tensor]]:  # of [B, F], [B, F]
-        """The relief of predictions and of their twins, from which `two_ways` learns to decide, in each of `dense`."""
+    ) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:  # [B, 2, 3, 3], of [B, F], [B, F]
+        """From which `two_ways` learns to decide: the frames of predictions and of their twins (object -> camera).
+
+        And the relief of both, in each of `dense`.
+        """
         chosen, _, _ = self._best(self._candidates(points, num_points, registers=True))
         twin = self._twin(chosen, points, registers=True)
-        return [(self._relief(chosen, clouds), self._relief(twin, clouds)) for clouds in dense]
+        return _frames(chosen, twin), [(self._relief(chosen, some), self._relief(twin, some)) for some in dense]
 
     def _candidates(
         self,
@@ -525,6 +530,14 @@ def _better(
     away = _angle(others.base[..., :3, :3], turn) > ANOTHER_WAY
     least, index = others.error.masked_fill(away, torch.inf).min(dim=1)
     return either(error <= least, first, others.select(index))
+
+
+def _frames(
+    one: Hypotheses,  # H = 1
+    other: Hypotheses,  # H = 1
+) -> Tensor:  # [B, 2, 3, 3]
+    """Canonical object space -> camera space, of both."""
+    return torch.cat([one.base, other.base], dim=1)[..., :3, :3]
 
 
 def _angle(

@@ -10,7 +10,9 @@ for all clouds. So from the relief of both explanations of many clouds (`relief`
    opposite each other: least kurtosis among whitened principal directions, and from there discriminant analysis on
    its own answers until these stay. Of several starts the one that parts the clusters best wins. Last, discriminant
    analysis of the same answers on the clouds as they are and with noise on their points, which hides what is fine: what
-   a scanner leaves of it must weigh no more than it is worth.
+   a scanner leaves of it must weigh no more than it is worth;
+3. the *surface*: a network that sees where relief is, taught by what the second step is sure of (`surface_decision`).
+   Its odds and those of relief are multiplied, as those of two witnesses.
 
 Which of the two clusters is called right does not matter: slots have no names, and whatever relates them to labels is
 fitted to the answers (`metrics.calibration`).
@@ -27,6 +29,7 @@ import torch
 from torch import Tensor, nn
 
 from articulate_ssl.geometry.se3 import invert_se3, se3
+from articulate_ssl.inference.surface_decision import SurfaceDecision
 
 _ALIKE = np.radians(25)  # rotations closer than this are the same twin
 # Of the clouds, that must have the same twin; and by how much their two explanations may differ in fit. Chosen.
@@ -56,7 +59,10 @@ class TwoWays(nn.Module):
         turn: [K, 4, 4] T_twin(j) = T(slot[j]) @ turn[j], of poses canonical object space -> cloud.
         scale: [F] standard deviation of the features' differences.
         weight: [F] of the standardised differences, in the logarithm of the odds.
+        surface: What was taught by the clearest of these decisions, or None.
     """
+
+    surface: SurfaceDecision | None
 
     def __init__(self, num_parts: int, num_features: int) -> None:
         super().__init__()
@@ -65,6 +71,7 @@ class TwoWays(nn.Module):
         self.register_buffer("turn", torch.eye(4).repeat(num_parts, 1, 1))
         self.register_buffer("scale", torch.ones(num_features))
         self.register_buffer("weight", torch.zeros(num_features))
+        self.register_module("surface", None)
 
     def twin_poses(
         self,
@@ -73,7 +80,7 @@ class TwoWays(nn.Module):
         """Part poses of the other explanation, before it is registered."""
         return part_pose[:, self.slot] @ self.turn.to(part_pose)
 
-    def log_odds(
+    def relief_odds(
         self,
         one: Tensor,  # [B, F] relief of an explanation
         other: Tensor,  # [B, F] and of its twin
@@ -130,8 +137,10 @@ class TwoWays(nn.Module):
         return True
 
     def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
-        """Weights from before there was a decision have none."""
-        for name, value in self.named_buffers():
+        """Weights from before there was a decision have none, and a network only those that were taught one."""
+        taught = any(name.startswith(f"{prefix}surface.") for name in state_dict)
+        self.surface = (self.surface or SurfaceDecision().to(self.weight).requires_grad_(False)) if taught else None
+        for name, value in self.named_buffers(recurse=False):
             state_dict.setdefault(prefix + name, value.clone())
         super()._load_from_state_dict(state_dict, prefix, *rest)
 

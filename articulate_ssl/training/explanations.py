@@ -15,6 +15,7 @@ from articulate_ssl.inference.prediction import Prediction, concatenate
 from articulate_ssl.inference.two_ways import FEWEST
 from articulate_ssl.ops.progress import announced
 from articulate_ssl.shape.object_axes import object_axes
+from articulate_ssl.training.surface_lessons import learn_surface
 
 if TYPE_CHECKING:
     from articulate_ssl.training.module import ArticulatedPoseModule
@@ -46,10 +47,18 @@ def learn_two_ways(
         return
     shown = announced(log, "two explanations, their relief", clouds.split(_BATCH))
     generator = torch.Generator().manual_seed(0)
-    reliefs = [estimator.reliefs(some[:, :count], module.num_points, (some, _noisy(some, generator))) for some in shown]
+    frames, reliefs, noisy_clouds = [], [], []
+    for some in shown:
+        noisy_clouds.append(_noisy(some, generator))
+        both, described = estimator.reliefs(some[:, :count], module.num_points, (some, noisy_clouds[-1]))
+        frames.append(both)
+        reliefs.append(described)
     clean, noisy = ([torch.cat(each) for each in zip(*some, strict=True)] for some in zip(*reliefs, strict=True))
-    if not estimator.two_ways.learn_decision(clean, noisy):
+    two_ways = estimator.two_ways
+    if not two_ways.learn_decision(clean, noisy):
         log.warning("too few clouds show all parts in both explanations: none is decided")
+        return
+    two_ways.surface = learn_surface((clouds, torch.cat(noisy_clouds)), torch.cat(frames), two_ways.relief_odds(*clean))
 
 
 @torch.no_grad()

@@ -203,8 +203,9 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
     def configure_optimizers(self) -> dict[str, Any]:
         """Adam; the category's shapes and joints are a group of their own."""
         shared = list(self.articulated.category.parameters())
-        category = set(map(id, shared))
-        others = [p for p in self.parameters() if id(p) not in category]
+        # What is learnt after the last step is not trained with the rest, nor when a run that ended goes on.
+        elsewhere = set(map(id, (*shared, *self.two_ways.parameters())))
+        others = [p for p in self.parameters() if id(p) not in elsewhere]
         optimizer = torch.optim.Adam(
             [{"params": others}, {"params": shared}], lr=self.schedule.learning_rate, betas=(0.9, 0.999), eps=1e-8
         )

@@ -6,9 +6,8 @@ from synthetic import write_synthetic_set
 from articulate_ssl.baselines.method import Effort, Problem
 from articulate_ssl.baselines.npcs import NPCSEPN, Target, distinct
 from articulate_ssl.baselines.npcs import NPCSKPConv as KPConv
-from articulate_ssl.baselines.npcs_network import Geometry, NetworkSize, WholeShape
+from articulate_ssl.baselines.npcs_network import WholeShape
 from articulate_ssl.baselines.perfect_oracle import perfect_oracle
-from articulate_ssl.baselines.spin_images import spin_images
 from articulate_ssl.geometry.kernel_points import symmetric_kernel_points
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE, screw_motion
@@ -16,10 +15,12 @@ from articulate_ssl.geometry.se3 import se3, transform_points
 from articulate_ssl.metrics.articulated_pose import cloud_errors
 from articulate_ssl.metrics.calibration import calibrate
 from articulate_ssl.network.backbone import GroupConvolutionBlock
+from articulate_ssl.network.surface_network import SurfaceCloud, SurfaceSize
 from articulate_ssl.ops.neighborhood import correlate, nearest_neighbors
+from articulate_ssl.ops.spin_images import spin_images
 from datamodules.articulated_dataset import ArticulatedDataset
 
-TINY = NetworkSize(read=48, centers=32, dims=(8, 8), radii=(0.3, 0.5), num_neighbors=8, global_dim=16, head_dim=16)
+TINY = SurfaceSize(read=48, centers=32, dims=(8, 8), radii=(0.3, 0.5), num_neighbors=8, global_dim=16, head_dim=16)
 
 
 def some(folder, count=4, num_points=64):
@@ -118,7 +119,7 @@ def test_what_is_turned_farther_than_the_category_allows_is_not_chosen(synthetic
         method = NPCSEPN(Problem(2, REVOLUTE, 1.5, 64, degrees), TINY)
         method.mean_rotation.copy_(root[0])
         rotation = method.predict(labels).part_pose[:, 0, :3, :3]
-        frame, _ = method.choose_frames(Geometry.of(labels["points"], *method.known_surface(labels), TINY))
+        frame, _ = method.choose_frames(SurfaceCloud.of(labels["points"], *method.known_surface(labels), TINY))
         chosen.append(roma.rotmat_geodesic_distance(frame, root[:1].expand_as(frame)).rad2deg())
         assert rotation.isfinite().all()
     assert chosen[0].max() > 60 > chosen[1].max()
@@ -151,7 +152,7 @@ def test_features_of_a_turned_copy_are_those_of_the_group_convolution_at_that_el
 def test_frames_of_training_are_right_and_wrong(synthetic_set):
     labels = some(synthetic_set, 8)
     method, target = make(NPCSEPN), Target.of(some(synthetic_set, 8))
-    geometry = Geometry.of(labels["points"], torch.zeros(8, 48, 34), torch.zeros(8, 48, 3), TINY)
+    geometry = SurfaceCloud.of(labels["points"], torch.zeros(8, 48, 34), torch.zeros(8, 48, 3), TINY)
     root = target.pose[:, 0, :3, :3]
     right, wrong = method.right_frames(target), method.wrong_frames(geometry, target)
 

@@ -77,19 +77,19 @@ def test_the_direction_that_parts_two_clusters_is_found_without_labels(generator
     assert max(largest.mean(), 1 - largest.mean()) < 0.6
 
 
-def test_log_odds_are_antisymmetric_and_say_how_sure(generator):
+def test_relief_odds_are_antisymmetric_and_say_how_sure(generator):
     values, sign = differences(1200, generator)
     one = torch.from_numpy(values)
     two_ways = TwoWays(1, 16)
     assert two_ways.learn_decision(*[(one, torch.zeros_like(one))] * 2)
-    odds = two_ways.log_odds(one, torch.zeros_like(one))
-    torch.testing.assert_close(two_ways.log_odds(torch.zeros_like(one), one), -odds)
+    odds = two_ways.relief_odds(one, torch.zeros_like(one))
+    torch.testing.assert_close(two_ways.relief_odds(torch.zeros_like(one), one), -odds)
     right = torch.from_numpy(sign).sign() == odds.sign()
     right = right if right.double().mean() > 0.5 else ~right
     sure = odds.abs() > odds.abs().median()
     assert right[sure].double().mean() > 0.99 > right[~sure].double().mean()
     one[0, 3] = torch.nan
-    assert two_ways.log_odds(one, torch.zeros_like(one))[0] == 0
+    assert two_ways.relief_odds(one, torch.zeros_like(one))[0] == 0
 
 
 def test_too_few_clouds_decide_nothing(generator):
@@ -111,7 +111,7 @@ def test_what_noise_hides_weighs_less_than_what_it_leaves(generator):
 
     def right(two_ways: TwoWays, noise: bool) -> float:
         values, sign = clouds(4000, noise)
-        share = float((two_ways.log_odds(values, torch.zeros_like(values)).sign() == sign).double().mean())
+        share = float((two_ways.relief_odds(values, torch.zeros_like(values)).sign() == sign).double().mean())
         return max(share, 1 - share)
 
     clean, sign = clouds(1000, noise=False)

@@ -116,8 +116,8 @@ def test_scans_are_decided_on_all_their_points(module, clouds):
     taught(module, 50.0)
     module.radius.follow(clouds[:, :POINTS], 0)
     seen = []
-    decide = module.two_ways.log_odds
-    module.two_ways.log_odds = lambda one, other: seen.append(one) or decide(one, other)
+    decide = module.two_ways.relief_odds
+    module.two_ways.relief_odds = lambda one, other: seen.append(one) or decide(one, other)
     scans = [cloud.double().numpy() * 7 + 1 for cloud in clouds[:2]]
     estimates = module.predict_clouds(scans)
     assert len(estimates) == len(seen) == 2

@@ -1,7 +1,7 @@
 import roma
 import torch
 
-from articulate_ssl.baselines.spin_images import HEIGHTS, RINGS, SPIN_CHANNELS, spin_images
+from articulate_ssl.ops.spin_images import HEIGHTS, RINGS, SPIN_CHANNELS, spin_images
 
 
 def plate(thickness, relief, count=2048, seed=0):

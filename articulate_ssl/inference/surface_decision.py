@@ -1,0 +1,59 @@
+"""A network that decides between two explanations of a cloud, taught by decisions that relief is sure of.
+
+Relief (`relief.py`) is a few numbers a part, and a linear decision on them is often unsure. What tells
+a keyboard from a screen is where on the plate the relief is. This network sees that: spin images and normals, as the
+cloud lies in the frame of either explanation. It is taught by what relief decides for clouds of which that is sure, in
+other proportions and with noise (`training/surface_lessons.py`); no label is read.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from articulate_ssl.network.surface_network import SurfaceCloud, SurfaceNetwork, SurfaceSize
+from articulate_ssl.ops.spin_images import spin_images
+
+SIZE = SurfaceSize()
+LOOKS = 2  # at other points of the cloud, whose odds are averaged; four and eight decide alike
+
+
+class SurfaceDecision(SurfaceNetwork):
+    """How right clouds look in some frame."""
+
+    def __init__(self, size: SurfaceSize = SIZE) -> None:
+        """Args: sizes."""
+        super().__init__(size)
+        self.size = size
+        self.right = nn.Linear(size.head_dim, 1)
+
+    def odds(
+        self,
+        cloud: SurfaceCloud,  # of [B, N, 3]
+        frames: Tensor,  # [B, 2, 3, 3] frame -> camera
+    ) -> Tensor:  # [B]
+        """Logarithm of the odds that clouds look right in the first frame and not in the second."""
+        one, other = self.seen(cloud.seen_in(frames)).unflatten(0, (-1, 2)).unbind(1)
+        return one - other
+
+    def seen(
+        self,
+        seen: SurfaceCloud,
+    ) -> Tensor:  # [B]
+        """How right clouds look as they are seen."""
+        return self.right(self.describe(seen)[1]).squeeze(-1)
+
+    @torch.no_grad()
+    def log_odds(
+        self,
+        frames: Tensor,  # [B, 2, 3, 3] of an explanation and of its twin -> camera
+        dense: Tensor,  # [B, P, 3] farthest-point order
+    ) -> Tensor:  # [B]
+        """`odds` of whole clouds, averaged over looks at different points."""
+        read = self.size.read
+        looks = max(1, min(LOOKS, dense.shape[1] // read))
+        points = dense[:, : looks * read]
+        images, normal = spin_images(points, dense)
+        own = (slice(first, None, looks) for first in range(looks))
+        odds = [self.odds(SurfaceCloud.of(points[:, k], images[:, k], normal[:, k], self.size), frames) for k in own]
+        return torch.stack(odds).mean(dim=0)

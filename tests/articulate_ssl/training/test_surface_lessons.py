@@ -1,0 +1,93 @@
+"""From relief that is sure of some clouds to a network that knows the others."""
+
+import pytest
+import roma
+import torch
+
+from articulate_ssl.network.surface_network import SurfaceSize
+from articulate_ssl.training import surface_lessons
+from articulate_ssl.training.surface_lessons import Lessons, learn_surface, teach
+
+TINY = SurfaceSize(read=48, centers=32, dims=(8, 8), radii=(0.3, 0.5), num_neighbors=8, global_dim=16, head_dim=16)
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    monkeypatch.setattr(surface_lessons, "SIZE", TINY)
+    monkeypatch.setattr(surface_lessons, "STEPS", 60)
+    monkeypatch.setattr(surface_lessons, "FEWEST", 20)
+
+
+def wedges(count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Clouds [n, 300, 3] that are thick at one end, turned anyhow; and frames [n, 2, 3, 3], the right one first."""
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.rand(count, 300, 3, generator=generator) - 0.5
+    points = points * torch.tensor([0.8, 0.5, 0.4])
+    points[..., 2] *= 0.2 + (points[..., 0] + 0.4)
+    quaternion = torch.nn.functional.normalize(torch.randn(count, 4, generator=generator), dim=1)
+    right = roma.unitquat_to_rotmat(quaternion)
+    wrong = right @ torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
+    return points @ right.mT, torch.stack([right, wrong], dim=1)
+
+
+def explained(count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Clouds, frames of explanations of which half are wrong, and odds: large and right of most, small of the rest."""
+    clouds, frames = wedges(count, seed)
+    generator = torch.Generator().manual_seed(seed + 1)
+    wrong = torch.rand(count, generator=generator) < 0.5
+    odds = torch.where(wrong, -1.0, 1.0) * (1 + torch.rand(count, generator=generator))
+    odds[torch.rand(count, generator=generator) < 0.2] *= 0.1
+    return clouds, torch.where(wrong[:, None, None, None], frames.flip(1), frames), odds
+
+
+def test_the_network_decides_clouds_that_it_never_saw():
+    clouds, frames, odds = explained(120, 0)
+    decision = learn_surface([clouds, clouds + 0.002 * torch.randn_like(clouds)], frames, odds)
+    clouds, frames = wedges(60, 7)
+    assert (decision.log_odds(frames, clouds) > 0).double().mean() > 0.9
+
+
+def test_what_contradicts_relief_is_thrown_away(caplog):
+    """Relief that says nothing true teaches nothing that holds for the clouds it is not sure of."""
+    clouds, frames, odds = explained(120, 0)
+    odds[odds.abs() < 0.5] *= -1
+    assert learn_surface([clouds], frames, odds) is None
+    assert "contradicts" in caplog.text
+
+
+def test_few_clouds_teach_nothing(monkeypatch):
+    clouds, frames, odds = explained(30, 0)
+    monkeypatch.setattr(surface_lessons, "FEWEST", 25)
+    monkeypatch.setattr(surface_lessons, "teach", lambda _: pytest.fail("taught in vain"))
+    assert learn_surface([clouds], frames, odds) is None
+
+
+def test_clouds_that_relief_knows_nothing_of_teach_nothing(monkeypatch):
+    clouds, frames, odds = explained(30, 0)
+    monkeypatch.setattr(surface_lessons, "teach", lambda _: pytest.fail("taught in vain"))
+    assert learn_surface([clouds], frames, torch.zeros_like(odds)) is None
+
+
+def test_lessons_are_the_same_every_time_and_leave_the_random_state_alone(monkeypatch):
+    monkeypatch.setattr(surface_lessons, "STEPS", 3)
+    lessons = Lessons.of([wedges(20, 0)[0]], wedges(20, 0)[1])
+    torch.manual_seed(5)
+    first = teach(lessons)
+    drawn = torch.rand(1)
+    torch.manual_seed(5)
+    assert torch.equal(torch.rand(1), drawn)
+    second = teach(lessons)
+    for one, other in zip(first.state_dict().values(), second.state_dict().values(), strict=True):
+        torch.testing.assert_close(one, other, atol=0, rtol=0)
+    assert not any(parameter.requires_grad for parameter in first.parameters())
+
+
+def test_drawn_clouds_are_those_of_their_frames():
+    """Whatever the version and the points drawn, in the right frame the thick end is where it is."""
+    clouds, frames = wedges(20, 0)
+    lessons = Lessons.of([clouds, clouds + 1e-3], frames)
+    cloud, own = lessons.draw(20, TINY.read, torch.Generator().manual_seed(0))
+    assert cloud.points.shape == (20, TINY.read, 3)
+    seen = cloud.seen_in(own[:, :1]).points
+    thick, thin = (seen[..., 2].abs() * (sign * seen[..., 0] > 0.1) for sign in (1, -1))
+    assert (thick.amax(dim=1) > thin.amax(dim=1)).double().mean() > 0.9
