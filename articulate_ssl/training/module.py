@@ -101,7 +101,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         discovery: DiscoveryOptions = DiscoveryOptions(),  # noqa: B008
         inference: InferenceOptions = InferenceOptions(),  # noqa: B008
         calibration_samples: int = 128,
-        two_ways_samples: int = 1000,
+        two_ways_samples: int = 2000,
         handedness_samples: int = 256,
         orientation_range: float = 180.0,
     ) -> None:
