@@ -10,7 +10,8 @@
    Where simulated views taught, those that a view is most like decide which way round it is, and say with the
    posed shape which parts points are of (`view_search`).
 4. *Decision*, where a category's clouds can be explained in two ways that fit alike: the relief of the surface decides
-   between the winner and its twin (`two_ways`), which is registered, too, if the winner was.
+   between the winner and its twin (`two_ways`), which is registered, too, if the winner was. Where fits tell them
+   apart, a network that they taught decides between the winner and its rival (`surface_decision`).
 5. *Hand*, where upright cameras see objects and their mirror images: clouds are explained in a mirror, too, and how
    well either explains them decides (`handedness`).
 
@@ -38,6 +39,7 @@ from articulate_ssl.inference.handedness import Handedness, in_the_mirror
 from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.inference.relief import NUM_FEATURES, describe_relief
 from articulate_ssl.inference.sliding_search import SlidingSearch
+from articulate_ssl.inference.surface_decision import SurfaceDecision
 from articulate_ssl.inference.two_ways import TwoWays
 from articulate_ssl.inference.view_search import ViewSearch
 from articulate_ssl.losses.reconstruction import distances_to_parts
@@ -242,7 +244,9 @@ class PoseEstimator:
             else:
                 chosen, other, margin = self._best(self._candidates(points, num_points, registers))
             if dense is not None and self.two_ways.learnt:
-                chosen, other, margin = self._decided(chosen, points, dense, registers)
+                chosen, other, margin = self._decided(chosen, points, dense, registers, self.two_ways.surface)
+            elif dense is not None and self.two_ways.surface is not None:
+                chosen, other, margin = self._believed_by_surface(chosen, other, margin, dense)
             rival = self._prediction(other, points, torch.zeros_like(margin))
             return self._prediction(chosen, points, margin, votes), rival
 
@@ -252,14 +256,31 @@ class PoseEstimator:
         points: Tensor,  # [B, N, 3]
         dense: Tensor,  # [B, P, 3]
         registers: bool,
+        surface: SurfaceDecision | None = None,
     ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
-        """Of the two explanations of clouds the one that their surface favours, the other, and by how much."""
-        twin, surface = self._twin(one, points, registers), self.two_ways.surface
+        """Of the two explanations of clouds the one that their relief favours, the other, and by how much.
+
+        Args:
+            surface: Has a say, too.
+        """
+        twin = self._twin(one, points, registers)
         odds = self.two_ways.relief_odds(self._relief(one, dense), self._relief(twin, dense))
         if surface is not None:
             odds = odds + surface.log_odds(_frames(one, twin), dense)
-        chosen, other = either(odds < 0, twin, one), either(odds < 0, one, twin)
-        return chosen, other, (odds.abs() / 2).tanh()  # how much likelier than not
+        return _likelier(odds, one, twin)
+
+    def _believed_by_surface(
+        self,
+        one: Hypotheses,  # H = 1
+        rival: Hypotheses,  # H = 1
+        margin: Tensor,  # [B]
+        dense: Tensor,  # [B, P, 3]
+    ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
+        """See `_decided`: of explanations and their rivals; what has no rival stays as it is."""
+        frames = _frames(one, rival)
+        chosen, other, decided = _likelier(self.two_ways.surface.log_odds(frames, dense), one, rival)
+        alone = (frames[:, 0] == frames[:, 1]).flatten(1).all(dim=1)
+        return chosen, other, torch.where(alone, margin, decided)
 
     def _best(self, candidates: Candidates) -> tuple[Hypotheses, Hypotheses, Tensor]:
         """The best candidate of every cloud, its rival, and the margin between them [B]."""
@@ -404,7 +425,7 @@ class PoseEstimator:
         state_range: Tensor,  # [J, 2] lowest and highest joint state in training
         dense: Tensor | None = None,  # [B, P, 3] the same clouds with all their points
     ) -> Prediction:
-        """Predictions of the category's shape and joints alone: no network has a say, a learnt decision has.
+        """Predictions of the category's shape and joints alone: no network has a say, a decision by relief has.
 
         They are searched (`search_articulated`) from the 60 rotations of the icosahedron, those within the orientation
         range, and from joints in the middle of their range and, in every combination, at either side of it; 3 states
@@ -530,6 +551,15 @@ def _better(
     away = _angle(others.base[..., :3, :3], turn) > ANOTHER_WAY
     least, index = others.error.masked_fill(away, torch.inf).min(dim=1)
     return either(error <= least, first, others.select(index))
+
+
+def _likelier(
+    odds: Tensor,  # [B] logarithm of those of the first
+    one: Hypotheses,  # H = 1
+    other: Hypotheses,  # H = 1
+) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
+    """The likelier, the other, and how much likelier than not it is."""
+    return either(odds < 0, other, one), either(odds < 0, one, other), (odds.abs() / 2).tanh()
 
 
 def _frames(

@@ -1,9 +1,10 @@
-"""A network that decides between two explanations of a cloud, taught by decisions that relief is sure of.
+"""A network that decides between two explanations of a cloud, and knows more than what taught it.
 
-Relief (`relief.py`) is a few numbers a part, and a linear decision on them is often unsure. What tells
-a keyboard from a screen is where on the plate the relief is. This network sees that: spin images and normals, as the
-cloud lies in the frame of either explanation. It is taught by what relief decides for clouds of which that is sure, in
-other proportions and with noise (`training/surface_lessons.py`); no label is read.
+It sees spin images and normals, as the cloud lies in the frame of either explanation, and is taught by what relief
+decides (`two_ways.py`), or by which one fits better, in other proportions and with noise
+(`training/surface_lessons.py`). No label is read. Its teachers see less: relief is a few numbers a part, and not where
+on it they come from; fits are mean distances, and go wrong where registration got stuck. What they get wrong is not
+wrong in the same way each time, what they get right is, and that is what a network learns.
 """
 
 from __future__ import annotations

@@ -14,6 +14,9 @@ for all clouds. So from the relief of both explanations of many clouds (`relief`
 3. the *surface*: a network that sees where relief is, taught by what the second step is sure of (`surface_decision`).
    Its odds and those of relief are multiplied, as those of two witnesses.
 
+Where fits tell the explanations apart there is no twin; there the network is taught by fits, and decides between what
+fits best and its rival.
+
 Which of the two clusters is called right does not matter: slots have no names, and whatever relates them to labels is
 fitted to the answers (`metrics.calibration`).
 """
@@ -59,7 +62,7 @@ class TwoWays(nn.Module):
         turn: [K, 4, 4] T_twin(j) = T(slot[j]) @ turn[j], of poses canonical object space -> cloud.
         scale: [F] standard deviation of the features' differences.
         weight: [F] of the standardised differences, in the logarithm of the odds.
-        surface: What was taught by the clearest of these decisions, or None.
+        surface: The network, if there is one; without `learnt` it decides between predictions and their rivals.
     """
 
     surface: SurfaceDecision | None

@@ -24,6 +24,10 @@ _BATCH = 16
 # Standard deviation of the noise, at most: a hundredth of the object's diagonal, that of a scanner of small things.
 # Of unseen laptops' clouds with noise of .02, 16.7 % were turned over without it, 14.2 % with it (step 86 of the log).
 _NOISE = 0.01
+# Share of the clouds that a network was not taught by, of which it must say what the teacher says. Relief: those that
+# it is not sure of, of which half is chance. Fits: clouds drawn at random; where more than one in ten is said to be
+# wrong, nobody knows who is. Both chosen.
+_UNSURE_AGREE, _FITS_AGREE = 0.6, 0.9
 _RELATED = 208  # clouds that show whether, and how, two explanations are related: that takes fewer than the decision
 
 log = logging.getLogger(__name__)
@@ -34,23 +38,30 @@ def learn_two_ways(
     module: ArticulatedPoseModule,
     clouds: Tensor,  # [n, N, 3] farthest-point order, dense
 ) -> None:
-    """Find out whether rivals are alike in all clouds; if so, tell the two apart by the relief of both."""
+    """Find out whether rivals are alike in all clouds; if so, tell the two apart by the relief of both.
+
+    Either way, a network is taught by what decides so far, relief or fits.
+    """
     if len(clouds) < FEWEST:
         log.info("no decision between two explanations: it takes %d training clouds, there are %d", FEWEST, len(clouds))
         return
-    estimator, count = module.estimator, max(module.num_points, module.inference.points)
-    shown = announced(log, "two explanations, their relation", clouds[:_RELATED].split(_BATCH))
-    found = [estimator.predict_with_rivals(some[:, :count], module.num_points) for some in shown]
-    chosen, rival = (concatenate(list(several)) for several in zip(*found, strict=True))
-    if not estimator.two_ways.learn_twin(_object_poses(chosen), _object_poses(rival), chosen.margin):
-        log.info("no decision between two explanations: fits tell them apart, or rivals differ from cloud to cloud")
-        return
-    shown = announced(log, "two explanations, their relief", clouds.split(_BATCH))
-    generator = torch.Generator().manual_seed(0)
+    two_ways = module.estimator.two_ways
+    chosen, rival = _with_rivals(module, clouds[:_RELATED], "two explanations, their relation")
+    if two_ways.learn_twin(_object_poses(chosen), _object_poses(rival), chosen.margin):
+        _learn_from_relief(module, clouds)
+    else:
+        log.info("the collection has no say in which explanation is right: fits differ, or rivals from cloud to cloud")
+        _learn_from_fits(module, clouds, chosen, rival)
+
+
+def _learn_from_relief(module: ArticulatedPoseModule, clouds: Tensor) -> None:
+    """The decision between twins."""
+    estimator, generator = module.estimator, torch.Generator().manual_seed(0)
     frames, reliefs, noisy_clouds = [], [], []
-    for some in shown:
+    for some in announced(log, "two explanations, their relief", clouds.split(_BATCH)):
         noisy_clouds.append(_noisy(some, generator))
-        both, described = estimator.reliefs(some[:, :count], module.num_points, (some, noisy_clouds[-1]))
+        points = some[:, : _registered_points(module)]
+        both, described = estimator.reliefs(points, module.num_points, (some, noisy_clouds[-1]))
         frames.append(both)
         reliefs.append(described)
     clean, noisy = ([torch.cat(each) for each in zip(*some, strict=True)] for some in zip(*reliefs, strict=True))
@@ -58,7 +69,37 @@ def learn_two_ways(
     if not two_ways.learn_decision(clean, noisy):
         log.warning("too few clouds show all parts in both explanations: none is decided")
         return
-    two_ways.surface = learn_surface((clouds, torch.cat(noisy_clouds)), torch.cat(frames), two_ways.relief_odds(*clean))
+    odds, frames = two_ways.relief_odds(*clean), torch.cat(frames)
+    favoured = torch.where((odds > 0)[:, None, None, None], frames, frames.flip(1))
+    clearest = odds.abs().argsort(descending=True)[: int((odds != 0).sum())]
+    two_ways.surface = learn_surface((clouds, torch.cat(noisy_clouds)), favoured, clearest, _UNSURE_AGREE)
+
+
+def _learn_from_fits(module: ArticulatedPoseModule, clouds: Tensor, chosen: Prediction, rival: Prediction) -> None:
+    """The decision between predictions, of the leading clouds those that are given, and their rivals."""
+    generator = torch.Generator().manual_seed(0)
+    found = [(chosen, rival)]
+    if len(clouds) > _RELATED:
+        found.append(_with_rivals(module, clouds[_RELATED:], "predictions and their rivals"))
+    frames = torch.stack([torch.cat([one.base_pose[:, :3, :3] for one in some]) for some in zip(*found, strict=True)])
+    frames = frames.transpose(0, 1)
+    rivalled = (frames[:, 0] != frames[:, 1]).flatten(1).any(dim=1).nonzero()[:, 0]
+    order = rivalled[torch.randperm(len(rivalled), generator=generator).to(rivalled.device)]
+    noisy = torch.cat([_noisy(some, generator) for some in clouds.split(_BATCH)])
+    module.estimator.two_ways.surface = learn_surface((clouds, noisy), frames, order, _FITS_AGREE)
+
+
+def _with_rivals(module: ArticulatedPoseModule, clouds: Tensor, work: str) -> tuple[Prediction, Prediction]:
+    """Predictions and their rivals, no decision made."""
+    shown = announced(log, work, clouds.split(_BATCH))
+    points = _registered_points(module)
+    found = [module.estimator.predict_with_rivals(some[:, :points], module.num_points) for some in shown]
+    return tuple(concatenate(list(several)) for several in zip(*found, strict=True))
+
+
+def _registered_points(module: ArticulatedPoseModule) -> int:
+    """How many leading points of a cloud are registered."""
+    return max(module.num_points, module.inference.points)
 
 
 @torch.no_grad()
@@ -67,7 +108,7 @@ def learn_handedness(
     clouds: Tensor,  # [n, N, 3] farthest-point order, of an upright camera
 ) -> None:
     """Find out whether some objects are mirror images of the others."""
-    estimator, network, count = module.estimator, module.articulated, max(module.num_points, module.inference.points)
+    estimator, network, count = module.estimator, module.articulated, _registered_points(module)
     shown = announced(log, "mirror images", clouds.split(_BATCH))
     errors = [estimator.mirror_errors(some[:, :count], module.num_points) for some in shown]
     axes = object_axes(network.category.articulated_shape(network.joint_type))

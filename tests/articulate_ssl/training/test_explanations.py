@@ -42,6 +42,76 @@ def test_an_object_with_one_explanation_gets_no_twin(module, clouds, monkeypatch
     assert not module.two_ways.learnt
 
 
+@pytest.fixture
+def untwinned(module, clouds, monkeypatch):
+    """What was handed to `learn_surface` where fits tell explanations apart, the relation read off three clouds."""
+    handed = []
+    monkeypatch.setattr(explanations, "FEWEST", 1)
+    monkeypatch.setattr(explanations, "_RELATED", 3)
+    monkeypatch.setattr(module.two_ways, "learn_twin", lambda *_: False)
+    monkeypatch.setattr(explanations, "learn_surface", lambda *lesson: handed.append(lesson))
+    learn_two_ways(module, clouds)
+    (lesson,) = handed
+    return lesson
+
+
+def test_where_fits_decide_they_teach(module, clouds, untwinned):
+    versions, frames, order, least = untwinned
+    chosen, rival = module.estimator.predict_with_rivals(clouds, module.num_points)
+    for found, expected in zip(frames.unbind(1), (chosen, rival), strict=True):
+        torch.testing.assert_close(found, expected.base_pose[:, :3, :3], atol=1e-4, rtol=0)
+    assert torch.equal(versions[0], clouds) and not torch.equal(versions[1], clouds)
+    assert least > 0.5 and len(set(order.tolist())) == len(order)
+    turned = (chosen.base_pose - rival.base_pose).abs().amax(dim=(1, 2)) > 0
+    assert sorted(order.tolist()) == turned.nonzero()[:, 0].tolist()
+    assert not module.two_ways.learnt
+
+
+class Preference(torch.nn.Module):
+    """In the place of a network: of two explanations the one of which the object's x axis points up more, or less."""
+
+    def __init__(self, sign: float) -> None:
+        super().__init__()
+        self.sign = sign
+
+    def log_odds(self, frames, dense):
+        return self.sign * (frames[:, 0, 2, 0] - frames[:, 1, 2, 0])
+
+
+@pytest.mark.parametrize("refine", [True, False])
+def test_a_network_that_fits_taught_decides_between_predictions_and_rivals(module, clouds, refine):
+    fits = module.estimator.predict_with_rivals(clouds[:, :POINTS], POINTS, refine, clouds)
+    found = {}
+    for sign in (1.0, -1.0):
+        module.two_ways.surface = Preference(sign)
+        found[sign] = module.estimator.predict_with_rivals(clouds[:, :POINTS], POINTS, refine, clouds)
+    same = torch.testing.assert_close
+    rivalled = found[1.0][0].margin > 0
+    assert rivalled.any()
+    same(found[1.0][0].base_pose[rivalled], found[-1.0][1].base_pose[rivalled])
+    up = [one.base_pose[rivalled, 2, 0] for one in found[1.0]]
+    assert (up[0] > up[1]).all()
+    blind = module.estimator.predict_with_rivals(clouds[:, :POINTS], POINTS, refine)
+    same(blind[0].base_pose, fits[0].base_pose, atol=0, rtol=0)
+
+
+def test_what_has_no_rival_keeps_its_margin(module, clouds, monkeypatch):
+    one, _, margin = module.estimator._best(module.estimator._candidates(clouds[:, :POINTS], POINTS, registers=False))
+    monkeypatch.setattr(module.estimator, "_best", lambda _: (one, one, torch.full_like(margin, 0.7)))
+    module.two_ways.surface = Preference(1.0)
+    found, _ = module.estimator.predict_with_rivals(clouds[:, :POINTS], POINTS, False, clouds)
+    assert (found.margin == 0.7).all()
+
+
+def test_no_network_has_a_say_in_the_search_without_one(module, clouds):
+    state_range = torch.tensor([[-1.0, 1.0]])
+    taught(module, 50.0)
+    before = module.estimator.search(clouds[:, :POINTS], state_range, clouds)
+    module.two_ways.surface = Preference(1e3)
+    after = module.estimator.search(clouds[:, :POINTS], state_range, clouds)
+    torch.testing.assert_close(after.base_pose, before.base_pose, atol=0, rtol=0)
+
+
 def test_the_decision_is_taught_with_noise_of_every_strength(module, clouds, monkeypatch):
     seen = []
 
