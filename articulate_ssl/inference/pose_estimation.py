@@ -263,11 +263,11 @@ class PoseEstimator:
         Args:
             surface: Has a say, too.
         """
-        twin = self._twin(one, points, registers)
+        twin, temperature = self._twin(one, points, registers), 1.0
         odds = self.two_ways.relief_odds(self._relief(one, dense), self._relief(twin, dense))
         if surface is not None:
-            odds = odds + surface.log_odds(_frames(one, twin), dense)
-        return _likelier(odds, one, twin)
+            odds, temperature = odds + surface.log_odds(_frames(one, twin), dense), surface.temperature
+        return _likelier(odds, one, twin, temperature)
 
     def _believed_by_surface(
         self,
@@ -278,7 +278,8 @@ class PoseEstimator:
     ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
         """See `_decided`: of explanations and their rivals; what has no rival stays as it is."""
         frames = _frames(one, rival)
-        chosen, other, decided = _likelier(self.two_ways.surface.log_odds(frames, dense), one, rival)
+        surface = self.two_ways.surface
+        chosen, other, decided = _likelier(surface.log_odds(frames, dense), one, rival, surface.temperature)
         alone = (frames[:, 0] == frames[:, 1]).flatten(1).all(dim=1)
         return chosen, other, torch.where(alone, margin, decided)
 
@@ -557,9 +558,10 @@ def _likelier(
     odds: Tensor,  # [B] logarithm of those of the first
     one: Hypotheses,  # H = 1
     other: Hypotheses,  # H = 1
+    temperature: Tensor | float,  # [] of the odds
 ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
     """The likelier, the other, and how much likelier than not it is."""
-    return either(odds < 0, other, one), either(odds < 0, one, other), (odds.abs() / 2).tanh()
+    return either(odds < 0, other, one), either(odds < 0, one, other), (odds.abs() / (2 * temperature)).tanh()
 
 
 def _frames(

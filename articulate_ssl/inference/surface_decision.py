@@ -20,13 +20,19 @@ LOOKS = 2  # at other points of the cloud, whose odds are averaged; four and eig
 
 
 class SurfaceDecision(SurfaceNetwork):
-    """How right clouds look in some frame."""
+    """How right clouds look in some frame.
+
+    Attributes:
+        temperature: [] by which odds are to be divided before they are believed (Guo et al. 2017): a network that is
+            taught to the end is surer than it is right. Which explanation is likelier does not depend on it.
+    """
 
     def __init__(self, size: SurfaceSize = SIZE) -> None:
         """Args: sizes."""
         super().__init__(size)
         self.size = size
         self.right = nn.Linear(size.head_dim, 1)
+        self.register_buffer("temperature", torch.tensor(1.0))
 
     def odds(
         self,

@@ -27,6 +27,7 @@ STEPS, BATCH, RATE = 1000, 32, 2e-3
 FEWEST = 200  # clouds that teach. Chosen.
 _DECAY, _GRADIENT_NORM = 1e-4, 1.0
 _CHUNK = 64  # clouds at a time
+_TEMPERATURES = 61  # from a tenth to a hundred, that are tried
 _SHOWN = 2  # times as many points as the network reads are known, of which it reads some
 _STRETCH = 0.15  # standard deviation of the logarithm of an axis' stretch
 _TURN = 0.1  # radians a direction, by which frames are turned
@@ -94,11 +95,15 @@ def learn_surface(
         decision.log_odds(*some)
         for some in zip(frames[rest].split(_CHUNK), versions[0][rest].split(_CHUNK), strict=True)
     ]
-    agrees = float((torch.cat(said) > 0).double().mean())
+    odds = torch.cat(said)
+    agrees = float((odds > 0).double().mean())
     log.info("a network taught by %d clouds says of %.0f %% of the others what taught it", len(taught), 100 * agrees)
     if agrees < least:
         log.warning("that is too few: no network decides")
         return None
+    temperatures = torch.logspace(-1, 2, _TEMPERATURES).to(odds)
+    surprise = functional.softplus(-odds[:, None] / temperatures).mean(dim=0)
+    decision.temperature.copy_(temperatures[surprise.argmin()])
     return decision
 
 

@@ -72,7 +72,7 @@ class Preference(torch.nn.Module):
 
     def __init__(self, sign: float) -> None:
         super().__init__()
-        self.sign = sign
+        self.sign, self.temperature = sign, 1.0
 
     def log_odds(self, frames, dense):
         return self.sign * (frames[:, 0, 2, 0] - frames[:, 1, 2, 0])

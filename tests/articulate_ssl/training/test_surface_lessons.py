@@ -45,6 +45,17 @@ def test_it_knows_more_than_a_teacher_that_is_sometimes_wrong():
     assert (decision.log_odds(frames, clouds) > 0).double().mean() > 0.95 > (~wrong).double().mean()
 
 
+def test_odds_are_believed_as_far_as_the_teacher_confirms_them():
+    """The more of the clouds that do not teach the teacher says something else of, the less."""
+    clouds, frames = wedges(120, 0)
+    contested = frames.clone()
+    contested[96:104] = frames[96:104].flip(1)
+    sure, doubtful = (learn_surface([clouds], some, torch.arange(120), 0.5) for some in (frames, contested))
+    assert doubtful.temperature > 2 * sure.temperature
+    odds = sure.log_odds(frames, clouds)
+    torch.testing.assert_close(doubtful.log_odds(frames, clouds), odds, atol=0, rtol=0)
+
+
 def test_what_contradicts_its_teacher_is_thrown_away(caplog):
     """Of the clouds that do not teach, it says the opposite of what the teacher says."""
     clouds, frames = wedges(120, 0)
