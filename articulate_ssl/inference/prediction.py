@@ -33,9 +33,9 @@ class Prediction:
         canonical_pivot: [B, J, 3] the same pivots in canonical object space.
         reconstruction_error: [B] distance between the cloud and its reconstruction (the loss's distance, L1 type).
         margin: [B] in [0, 1], how much better this reconstructs the cloud than the best rival that is turned another
-            way: 1 - error / rival's error; 0 if a rival is as good, 1 if none was considered. No probability. Where the
-            relief decided between two explanations (`two_ways`), how much likelier than not this one is; where clouds
-            may show mirror images (`handedness`), at most as much.
+            way: 1 - error / rival's error; 0 if a rival is as good, 1 if none was considered. No probability. Where
+            relief or a network decided between two explanations (`two_ways`, `surface_decision`), how much likelier
+            than not this one is; where clouds may show mirror images (`handedness`), at most as much.
     """
 
     part_id: Tensor
