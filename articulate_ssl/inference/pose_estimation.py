@@ -39,6 +39,7 @@ from articulate_ssl.inference.handedness import Handedness, in_the_mirror
 from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.inference.relief import NUM_FEATURES, describe_relief
 from articulate_ssl.inference.sliding_search import SlidingSearch
+from articulate_ssl.inference.state_range import StateRange
 from articulate_ssl.inference.surface_decision import SurfaceDecision
 from articulate_ssl.inference.two_ways import TwoWays
 from articulate_ssl.inference.view_search import ViewSearch
@@ -56,7 +57,6 @@ from articulate_ssl.shape.stretch import principal_directions
 # views each the mIoU is 90, 91 and 47 (safes, washing machines, chests) by three quarters, 90, 89 and 44 by a half, 90,
 # 81 and 35 by nothing (docs/experiments.md, step 99).
 _VIEWS_SAY = 0.75
-_SIDE = 1 / 3  # of the width of a joint's range, from its middle, where a search without a network starts, too
 
 
 @dataclass(frozen=True)
@@ -110,6 +110,7 @@ class PoseEstimator:
         sliding: The search for parts that slide, if one was learnt; a module owns it.
         view_search: The search among simulated views, if there were any; a module owns it.
         handedness: Whether clouds show the category's mirror image, if some do; a module owns it.
+        states: Which joint states training clouds showed; a module owns it.
     """
 
     agreement: float = 0.0
@@ -130,6 +131,7 @@ class PoseEstimator:
         self.sliding = SlidingSearch(*articulated.category.template.shape[:2])
         self.view_search = ViewSearch(articulated.num_parts)
         self.handedness = Handedness()
+        self.states = StateRange(articulated.num_parts - 1)
 
     def align(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Stage 0: clouds turned roughly to canonical orientation [B, N, 3], and the pose [B, 4, 4] that undoes it."""
@@ -246,7 +248,7 @@ class PoseEstimator:
             if dense is not None and self.two_ways.learnt:
                 chosen, other, margin = self._decided(chosen, points, dense, registers, self.two_ways.surface)
             elif dense is not None and self.two_ways.surface is not None:
-                chosen, other, margin = self._believed_by_surface(chosen, other, margin, dense)
+                chosen, other, margin = self._preferred(chosen, other, margin, points, dense, registers)
             rival = self._prediction(other, points, torch.zeros_like(margin))
             return self._prediction(chosen, points, margin, votes), rival
 
@@ -269,19 +271,43 @@ class PoseEstimator:
             odds, temperature = odds + surface.log_odds(_frames(one, twin), dense), surface.temperature
         return _likelier(odds, one, twin, temperature)
 
-    def _believed_by_surface(
+    def _preferred(
         self,
         one: Hypotheses,  # H = 1
         rival: Hypotheses,  # H = 1
         margin: Tensor,  # [B]
+        points: Tensor,  # [B, N, 3]
         dense: Tensor,  # [B, P, 3]
+        registers: bool,
     ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
-        """See `_decided`: of explanations and their rivals; what has no rival stays as it is."""
+        """See `_decided`: of explanations and their rivals; what has no rival stays as it is.
+
+        A rival that is preferred fitted worse, mostly as its joints got stuck: it is registered again from others.
+        """
         frames = _frames(one, rival)
         surface = self.two_ways.surface
         chosen, other, decided = _likelier(surface.log_odds(frames, dense), one, rival, surface.temperature)
         alone = (frames[:, 0] == frames[:, 1]).flatten(1).all(dim=1)
+        stuck = (chosen.base != one.base).flatten(1).any(dim=1).nonzero()[:, 0]
+        if registers and len(stuck):
+            freed = self._freed(chosen.rows(stuck), points[stuck])
+            chosen = chosen.at(
+                chosen.base.index_copy(0, stuck, freed.base), chosen.state.index_copy(0, stuck, freed.state)
+            )
         return chosen, other, torch.where(alone, margin, decided)
+
+    def _freed(
+        self,
+        one: Hypotheses,  # H = 1
+        points: Tensor,  # [B, N, 3]
+    ) -> Hypotheses:  # H = 1
+        """Explanations registered again from other joint states, the best that is turned as before."""
+        starts = self.states.starts().to(points)
+        copies = one.select(torch.zeros(len(points), 1 + len(starts), dtype=torch.long, device=points.device))
+        state = torch.cat([one.state, starts.expand(len(points), -1, -1)], dim=1)
+        found, error = self._registered(copies.at(copies.base, state), points)
+        away = _angle(found.base[..., :3, :3], one.base[:, 0, :3, :3]) > ANOTHER_WAY
+        return found.select(error.masked_fill(away, torch.inf).argmin(dim=1))
 
     def _best(self, candidates: Candidates) -> tuple[Hypotheses, Hypotheses, Tensor]:
         """The best candidate of every cloud, its rival, and the margin between them [B]."""
@@ -423,24 +449,22 @@ class PoseEstimator:
     def search(
         self,
         points: Tensor,  # [B, N, 3] normalised, farthest-point order
-        state_range: Tensor,  # [J, 2] lowest and highest joint state in training
         dense: Tensor | None = None,  # [B, P, 3] the same clouds with all their points
     ) -> Prediction:
         """Predictions of the category's shape and joints alone: no network has a say, a decision by relief has.
 
         They are searched (`search_articulated`) from the 60 rotations of the icosahedron, those within the orientation
-        range, and from joints in the middle of their range and, in every combination, at either side of it; 3 states
-        for one joint. Where parts slide, `sliding_search` takes the place of that, if there are dense clouds, and
-        `view_search` where simulated views taught.
+        range, and from the joint states where `StateRange` starts; 3 for one joint. Where parts slide, `sliding_search`
+        takes the place of that, if there are dense clouds, and `view_search` where simulated views taught.
         """
-        seen = self._searched(points, state_range, dense)
+        seen = self._searched(points, dense)
         if not self.handedness.learnt:
             return seen
         dense = None if dense is None else in_the_mirror(dense)
-        mirrored = self._searched(in_the_mirror(points), state_range, dense)
+        mirrored = self._searched(in_the_mirror(points), dense)
         return self.handedness.likelier((seen, seen), (mirrored, mirrored))[0]
 
-    def _searched(self, points: Tensor, state_range: Tensor, dense: Tensor | None) -> Prediction:
+    def _searched(self, points: Tensor, dense: Tensor | None) -> Prediction:
         """See `search`: by the category's own hand."""
         with torch.autocast(points.device.type, enabled=False):
             if self.view_search.learnt:
@@ -449,13 +473,10 @@ class PoseEstimator:
             if dense is not None and self.sliding.learnt:
                 found, _, margin, votes = self._slid(points, dense)
                 return self._prediction(found, points, margin, votes)
-            low, high = state_range.to(points).unbind(-1)
-            middle, side = (low + high) / 2, _SIDE * (high - low)
-            sides = torch.cartesian_prod(*torch.stack([middle - side, middle + side], dim=-1)).view(-1, len(middle))
             rotations = rotation_group(60).elements.to(points)
             rotations = rotations[self.observation.orientation.contains(rotations)]
             shape = self.articulated.category.articulated_shape(self.articulated.joint_type)
-            base, state, error = search_articulated(shape, points, rotations, torch.cat([middle[None], sides]))
+            base, state, error = search_articulated(shape, points, rotations, self.states.starts().to(points))
             candidates = Candidates(error, base, self.articulated.category_at(base, state).select)
             found, _, margin = self._best(candidates)
             if dense is not None and self.two_ways.learnt:

@@ -13,6 +13,8 @@ from articulate_ssl.network.heads.structure import Structure
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.joints import Joints
 
+LINES = ("confidence", "pair_pivot", "pair_axis", "pivot", "axis")  # of a structure, which every cloud has of its own
+
 
 @dataclass(frozen=True)
 class Hypotheses:
@@ -86,6 +88,18 @@ class Hypotheses:
             state=self.state[rows, index],
         )
 
+    def rows(self, index: Tensor) -> Hypotheses:
+        """Those of some of the clouds, [n]."""
+        lines = {name: getattr(self.structure, name)[index] for name in LINES}
+        return replace(
+            self,
+            shape=CanonicalShape(*(value[index] for value in self.shape)),
+            structure=replace(self.structure, **lines),
+            base=self.base[index],
+            state=self.state[index],
+            association_logits=self.association_logits[index],
+        )
+
     def at(
         self,
         base: Tensor,  # [B, H, 4, 4]
@@ -116,8 +130,7 @@ def either(
     def chosen(first: Tensor, second: Tensor) -> Tensor:
         return torch.where(where.view(-1, *[1] * (first.dim() - 1)), first, second)
 
-    lines = ("confidence", "pair_pivot", "pair_axis", "pivot", "axis")
-    structure = {name: chosen(getattr(one.structure, name), getattr(other.structure, name)) for name in lines}
+    structure = {name: chosen(getattr(one.structure, name), getattr(other.structure, name)) for name in LINES}
     return replace(
         one,
         shape=CanonicalShape(*map(chosen, one.shape, other.shape)),

@@ -38,7 +38,7 @@ from articulate_ssl.training.hub import HubWeights
 from articulate_ssl.training.label_free_report import LabelFreeReport
 from articulate_ssl.training.recipes import recipe_class
 from articulate_ssl.training.recipes.recipe import Outcome
-from articulate_ssl.training.running_statistics import RadiusStatistics, StateRange
+from articulate_ssl.training.running_statistics import RadiusStatistics
 from articulate_ssl.training.schedule import ScheduleOptions
 from articulate_ssl.training.self_agreement import LearnConfidence, look_twice
 from articulate_ssl.training.set_clouds import SetClouds
@@ -130,9 +130,9 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         )
         self.two_ways, self.sliding = self.estimator.two_ways, self.estimator.sliding
         self.view_search, self.handedness = self.estimator.view_search, self.estimator.handedness
+        self.states = self.estimator.states
         self.recipe = recipe_type(self.estimator, objective, schedule, discovery)
         self.radius = RadiusStatistics()
-        self.states = StateRange(num_parts - 1)
         self.confidence = Confidence()
         self.num_points = 512  # of a training cloud; a scan is thinned to as many
 
@@ -344,7 +344,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
 
     def _search(self, batch: dict[str, Tensor]) -> Prediction:
         inputs = split_labels(batch)[0]
-        return self.estimator.search(inputs["points"], self.state_range, inputs["dense_points"])
+        return self.estimator.search(inputs["points"], inputs["dense_points"])
 
     def whole(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """The batch with as many points as registration reads; the networks still see those that they would."""

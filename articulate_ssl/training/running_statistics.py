@@ -6,7 +6,6 @@ import torch
 from torch import Tensor, nn
 
 _RADIUS_WEIGHT = 0.01  # of a batch, once a hundred are seen
-_RANGE_WEIGHT = 0.02  # of a batch
 
 
 class RadiusStatistics(nn.Module):
@@ -33,24 +32,3 @@ class RadiusStatistics(nn.Module):
         weight = max(_RADIUS_WEIGHT, 1 / (step + 1))
         self.mean.lerp_(radius.mean(), weight)
         self.square.lerp_(radius.square().mean(), weight)
-
-
-class StateRange(nn.Module):
-    """Running means of the lowest and of the highest joint state of each batch: narrower than all states seen.
-
-    Attributes:
-        limits: [J, 2].
-    """
-
-    def __init__(self, num_joints: int) -> None:
-        super().__init__()
-        self.register_buffer("limits", torch.zeros(num_joints, 2))
-
-    @torch.no_grad()
-    def follow(
-        self,
-        state: Tensor,  # [B, J]
-    ) -> None:
-        """Take a batch into account."""
-        seen = torch.stack([state.amin(dim=0), state.amax(dim=0)], dim=-1)
-        self.limits.lerp_(seen, _RANGE_WEIGHT if self.limits.any() else 1.0)

@@ -131,7 +131,7 @@ def test_the_search_competes_with_the_network(learnt):
     estimator.sliding.load_state_dict(learnt.state_dict())
     with torch.inference_mode():  # as a trainer tests
         found = estimator.predict(points.clone(), 256, dense=data.points.clone())
-    alone = estimator.search(points, torch.zeros(2, 2), data.points)
+    alone = estimator.search(points, data.points)
     truth = data.base[:, :3, :3]
     for prediction in (found, alone):
         assert roma.rotmat_geodesic_distance(prediction.base_pose[:, :3, :3], truth).rad2deg().max() < 5

@@ -1,9 +1,11 @@
 """From a module's own predictions to a decision between two explanations, and what the decision then changes."""
 
 import pytest
+import roma
 import torch
 from tiny import POINTS, tiny_module
 
+from articulate_ssl.inference.candidates import ANOTHER_WAY
 from articulate_ssl.inference.relief import NUM_FEATURES
 from articulate_ssl.training import explanations
 from articulate_ssl.training.explanations import _object_poses, learn_two_ways
@@ -78,21 +80,39 @@ class Preference(torch.nn.Module):
         return self.sign * (frames[:, 0, 2, 0] - frames[:, 1, 2, 0])
 
 
-@pytest.mark.parametrize("refine", [True, False])
-def test_a_network_that_fits_taught_decides_between_predictions_and_rivals(module, clouds, refine):
-    fits = module.estimator.predict_with_rivals(clouds[:, :POINTS], POINTS, refine, clouds)
+def test_a_network_that_fits_taught_decides_between_predictions_and_rivals(module, clouds):
+    fits = module.estimator.predict_with_rivals(clouds[:, :POINTS], POINTS, False, clouds)
     found = {}
     for sign in (1.0, -1.0):
         module.two_ways.surface = Preference(sign)
-        found[sign] = module.estimator.predict_with_rivals(clouds[:, :POINTS], POINTS, refine, clouds)
+        found[sign] = module.estimator.predict_with_rivals(clouds[:, :POINTS], POINTS, False, clouds)
     same = torch.testing.assert_close
     rivalled = found[1.0][0].margin > 0
     assert rivalled.any()
     same(found[1.0][0].base_pose[rivalled], found[-1.0][1].base_pose[rivalled])
     up = [one.base_pose[rivalled, 2, 0] for one in found[1.0]]
     assert (up[0] > up[1]).all()
-    blind = module.estimator.predict_with_rivals(clouds[:, :POINTS], POINTS, refine)
+    blind = module.estimator.predict_with_rivals(clouds[:, :POINTS], POINTS, False)
     same(blind[0].base_pose, fits[0].base_pose, atol=0, rtol=0)
+
+
+def test_a_preferred_rival_is_registered_again_from_other_states(module, clouds):
+    """It fits no worse than before, stays turned as it was, and others stay as they are."""
+    points = clouds[:, :POINTS]
+    one, rival, _ = module.estimator._best(module.estimator._candidates(points, POINTS, registers=True))
+    other = rival.base[:, 0, 2, 0] - one.base[:, 0, 2, 0]
+    module.states.limits.copy_(torch.tensor([[-1.0, 1.0]]))
+    for sign in (1.0, -1.0):
+        module.two_ways.surface = Preference(sign)
+        found, _ = module.estimator.predict_with_rivals(points, POINTS, True, clouds)
+        swapped = sign * other > 0
+        before = module.estimator._prediction(rival, points, found.margin)
+        kept = module.estimator._prediction(one, points, found.margin)
+        assert swapped.any()
+        assert (found.reconstruction_error <= before.reconstruction_error + 1e-3)[swapped].all()
+        angle = roma.rotmat_geodesic_distance(found.base_pose[:, :3, :3], before.base_pose[:, :3, :3])
+        assert (angle[swapped] < ANOTHER_WAY + 1e-4).all()
+        torch.testing.assert_close(found.base_pose[~swapped], kept.base_pose[~swapped])
 
 
 def test_what_has_no_rival_keeps_its_margin(module, clouds, monkeypatch):
@@ -104,11 +124,11 @@ def test_what_has_no_rival_keeps_its_margin(module, clouds, monkeypatch):
 
 
 def test_no_network_has_a_say_in_the_search_without_one(module, clouds):
-    state_range = torch.tensor([[-1.0, 1.0]])
+    module.states.limits.copy_(torch.tensor([[-1.0, 1.0]]))
     taught(module, 50.0)
-    before = module.estimator.search(clouds[:, :POINTS], state_range, clouds)
+    before = module.estimator.search(clouds[:, :POINTS], clouds)
     module.two_ways.surface = Preference(1e3)
-    after = module.estimator.search(clouds[:, :POINTS], state_range, clouds)
+    after = module.estimator.search(clouds[:, :POINTS], clouds)
     torch.testing.assert_close(after.base_pose, before.base_pose, atol=0, rtol=0)
 
 
@@ -164,11 +184,11 @@ def test_unregistered_predictions_have_a_twin_that_follows_from_them(module, clo
 
 
 def test_a_search_without_a_network_is_decided_alike(module, clouds):
-    state_range = torch.tensor([[-1.0, 1.0]])
+    module.states.limits.copy_(torch.tensor([[-1.0, 1.0]]))
     taught(module, 50.0)
-    longer = module.estimator.search(clouds[:, :POINTS], state_range, clouds)
+    longer = module.estimator.search(clouds[:, :POINTS], clouds)
     taught(module, -50.0)
-    shorter = module.estimator.search(clouds[:, :POINTS], state_range, clouds)
+    shorter = module.estimator.search(clouds[:, :POINTS], clouds)
     torch.testing.assert_close(longer.margin, shorter.margin)
     turned = (longer.base_pose - shorter.base_pose).abs().amax(dim=(1, 2)) > 1e-3
     assert turned[longer.margin > 0].all() and (longer.margin > 0).any()
