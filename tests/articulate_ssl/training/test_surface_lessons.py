@@ -14,7 +14,6 @@ TINY = SurfaceSize(read=48, centers=32, dims=(8, 8), radii=(0.3, 0.5), num_neigh
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     monkeypatch.setattr(surface_lessons, "SIZE", TINY)
-    monkeypatch.setattr(surface_lessons, "STEPS", 60)
     monkeypatch.setattr(surface_lessons, "FEWEST", 20)
 
 
@@ -71,7 +70,7 @@ def test_few_clouds_teach_nothing(monkeypatch):
 
 
 def test_lessons_are_the_same_every_time_and_leave_the_random_state_alone(monkeypatch):
-    monkeypatch.setattr(surface_lessons, "STEPS", 3)
+    monkeypatch.setattr(surface_lessons, "TIMES", 4)
     lessons = Lessons.of([wedges(20, 0)[0]], wedges(20, 0)[1])
     torch.manual_seed(5)
     first = teach(lessons)
