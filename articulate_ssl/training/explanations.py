@@ -46,6 +46,7 @@ def learn_two_ways(
         log.info("no decision between two explanations: it takes %d training clouds, there are %d", FEWEST, len(clouds))
         return
     two_ways = module.estimator.two_ways
+    two_ways.surface = None  # of a run that ended and goes on
     chosen, rival = _with_rivals(module, clouds[:_RELATED], "two explanations, their relation")
     if two_ways.learn_twin(_object_poses(chosen), _object_poses(rival), chosen.margin):
         _learn_from_relief(module, clouds)
