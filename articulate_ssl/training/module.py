@@ -76,8 +76,9 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         inference: Refinement at test time.
         calibration_samples: Training clouds on which `lightning test` relates slots and canonical spaces to labels, and
             from which confidence is learnt without them.
-        two_ways_samples: Training clouds from which the decision between two explanations that fit alike is learnt
-            (`inference.two_ways`), if the category has such; 0 learns none.
+        two_ways_samples: Training clouds from which the decision between two explanations is learnt, of those that fit
+            alike (`inference.two_ways`) or of predictions and their rivals (`inference.surface_decision`); 0 learns
+            none.
         handedness_samples: Training clouds of an upright camera from which it is learnt whether some objects are mirror
             images of the others (`inference.handedness`); 0 learns nothing of it.
         orientation_range: How far objects are turned from their mean orientation at most, in degrees; 180 stands for
