@@ -111,7 +111,8 @@ class Workplace:
     def _noted(self, stage: Stage) -> dict[str, Any]:
         file = self.folder / f"{stage.name}.json"
         note = json.loads(file.read_text()) if file.is_file() else {}
-        return note if note.get("command") == list(stage.command) else {}
+        # Of whichever environment the interpreter is: work in a shared folder goes on from another checkout.
+        return note if note.get("command", [])[1:] == list(stage.command)[1:] else {}
 
     def _note(self, stage: Stage, seconds: float | None, spent: float) -> None:
         with atomic_write(self.folder / f"{stage.name}.json") as file:

@@ -44,6 +44,8 @@ def test_a_finished_stage_is_noted_with_its_time_and_its_words(tmp_path):
     assert work.seconds(stage) > 0 and work.log(stage).read_text() == "words\n"
     assert len(said) == 2 and said[1].startswith("it: talk took")
     assert Workplace("it", tmp_path).seconds(Stage("talk", _python("print('others')"))) is None
+    # Another checkout has its own interpreter; the work is the same.
+    assert work.seconds(Stage("talk", ("/elsewhere/bin/python", *_python("print('words')")[1:]))) > 0
 
 
 def test_a_failure_names_the_log(tmp_path):
