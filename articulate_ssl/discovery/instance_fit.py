@@ -28,6 +28,7 @@ _SOFTNESS = 0.05
 _BOUND = 0.35
 _START = 0.95  # of the bound: a start beyond is one here, where the gradient still lives
 _RIDGE = 1e-3  # weight of the squared log-stretch: decides what the clouds leave open
+_HELD = 0.1  # weight of the squared distance that a cloud's own joint lines go from where they started. Chosen.
 _RATE = 0.01  # of Adam, at the start
 _LAST_RATE = 0.02  # what is left of it in the last cycle
 _POINTS = 384  # of template and cloud, drawn anew for every step
@@ -43,7 +44,8 @@ class InstanceFit:
     where parts slide, they also lie elsewhere beside their slide: drawers of one chest are lower than those of another.
 
     Args:
-        shape: Points and labels at joint state zero; states stay within the joints' limits if there are any.
+        shape: Points and labels at joint state zero; states stay within the joints' limits if there are any. Joint
+            lines [n, J, 3] are each cloud's own: their pivots then move a little even if nothing is shared.
         base: [n, 4, 4] start.
         state: [n, J] start.
         generator: Of the points drawn.
@@ -65,6 +67,7 @@ class InstanceFit:
         self._shape, self._base, self._generator = shape, base, generator
         self._axis, self._pivot, self._state = shape.joints.axis.clone(), shape.joints.pivot.clone(), state.clone()
         self._turn, self._shift = (base.new_zeros(len(base), 3) for _ in range(2))
+        self._start = self._pivot.clone() if self._pivot.dim() == 3 else None
         self._stretch, self._beside = (base.new_zeros(len(base), shape.num_parts, 3) for _ in range(2))
         if log_stretch is not None:
             self._stretch += _BOUND * (log_stretch / _BOUND).clamp(-_START, _START).atanh()
@@ -133,6 +136,7 @@ class InstanceFit:
         # In a frame that clouds have in common, what slides slides along one of its axes, exactly.
         lines = [self._axis, self._pivot] if self.axes is None else [self._pivot]
         own = own if self.axes is None else [*own, self._beside]
+        own = own if self._start is None else [*own, self._pivot]
         parameters = lines + own if shared else own
         optimizer = torch.optim.Adam([p.requires_grad_() for p in parameters], lr=_RATE)
         for cycle in range(cycles):
@@ -202,7 +206,10 @@ class InstanceFit:
         posed, seen = self.posed(rows), clouds[:, self._draw(clouds.shape[1], clouds.device)]
         error = _softened(_distance(posed, seen)).mean(dim=1) + _softened(_distance(seen, posed)).mean(dim=1)
         counts = error.detach() <= error.detach().quantile(keep)
-        return error[counts].sum() + _RIDGE * (self._stretch.square().sum() + self._beside.square().sum())
+        ridge = _RIDGE * (self._stretch.square().sum() + self._beside.square().sum())
+        if self._start is not None:
+            ridge = ridge + _HELD * (self._pivot - self._start).square().sum()
+        return error[counts].sum() + ridge
 
     def _draw(self, total: int, device: torch.device) -> Tensor:
         return torch.randperm(total, generator=self._generator)[:_POINTS].to(device)

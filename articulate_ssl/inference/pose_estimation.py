@@ -4,7 +4,8 @@
 2. *Iteration*: the articulated network gives a hypothesis per group element; from the second pass on it reads the
    cloud in the part frames of the last winner (paper, Sec. 3.1).
 3. *Registration* at test time: the leading hypotheses' predicted shapes are registered to the cloud without leaving
-   their joints, and the best reconstruction wins.
+   their joints, and the best reconstruction wins. What is decided for in the end takes the cloud's own proportions
+   (`proportions`).
    Where parts slide, clouds of other objects that are most like it decide which way round it is; where these are
    labelled, they say which parts points are of, and where the category's shape is (`sliding_search`).
    Where simulated views taught, those that a view is most like decide which way round it is, and say with the
@@ -37,6 +38,7 @@ from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
 from articulate_ssl.inference.candidates import ANOTHER_WAY, Candidates, Iteration, rivals
 from articulate_ssl.inference.handedness import Handedness, in_the_mirror
 from articulate_ssl.inference.prediction import Prediction
+from articulate_ssl.inference.proportions import fit_proportions
 from articulate_ssl.inference.relief import NUM_FEATURES, describe_relief
 from articulate_ssl.inference.sliding_search import SlidingSearch
 from articulate_ssl.inference.state_range import StateRange
@@ -70,6 +72,9 @@ class InferenceOptions:
             closed laptop is shows in less than the spacing of the few points that suffice for the networks.
         candidates: Hypotheses that are refined; the best reconstruction wins.
         rounds: Rounds of registration.
+        proportions: Cycles of six steps of descent in which a complete cloud's explanation takes its own proportions
+            in the end (`proportions.py`); 0 leaves it to the network. Not where parts slide, whose places similar
+            clouds say.
         most_turned: Degrees by which registration may turn a part from where the network put it; of a hypothesis that
             it turns further, the network's word stays. 180 lets it go anywhere. Where distances count one way, nothing
             in a cloud says that a hidden part is in the wrong place, but the network has seen where they are.
@@ -86,6 +91,7 @@ class InferenceOptions:
     points: int = 512
     candidates: int = 4
     rounds: int = 8
+    proportions: int = 25
     most_turned: float = 180.0
     coarse_scale: float = 0.05
     fine_scale: float = 0.02
@@ -209,19 +215,23 @@ class PoseEstimator:
         num_points: int,
         refine: bool | None = None,
         dense: Tensor | None = None,  # [B, P, 3]
+        fits: bool = True,
     ) -> tuple[Prediction, Prediction]:
         """`predict`, and of every cloud the best hypothesis that is turned another way (the same, if none is).
+
+        Args:
+            fits: Predictions take the clouds' proportions; rivals do not.
 
         Raises:
             ValueError: if a cloud has NaN or infinite points.
         """
         if not torch.isfinite(points).all():
             raise ValueError("a cloud has NaN or infinite points")
-        seen = self._explained(points, num_points, refine, dense)
+        seen = self._explained(points, num_points, refine, dense, fits)
         if not self.handedness.learnt:
             return seen
         dense = None if dense is None else in_the_mirror(dense)
-        return self.handedness.likelier(seen, self._explained(in_the_mirror(points), num_points, refine, dense))
+        return self.handedness.likelier(seen, self._explained(in_the_mirror(points), num_points, refine, dense, fits))
 
     @torch.no_grad()
     def mirror_errors(
@@ -234,7 +244,7 @@ class PoseEstimator:
         return tuple(prediction.reconstruction_error for prediction in seen)
 
     def _explained(
-        self, points: Tensor, num_points: int, refine: bool | None, dense: Tensor | None
+        self, points: Tensor, num_points: int, refine: bool | None, dense: Tensor | None, fits: bool = True
     ) -> tuple[Prediction, Prediction]:
         """See `predict_with_rivals`: by the category's own hand."""
         with torch.autocast(points.device.type, enabled=False):
@@ -249,6 +259,8 @@ class PoseEstimator:
                 chosen, other, margin = self._decided(chosen, points, dense, registers, self.two_ways.surface)
             elif dense is not None and self.two_ways.surface is not None:
                 chosen, other, margin = self._preferred(chosen, other, margin, points, dense, registers)
+            if registers and fits:
+                chosen = self._in_proportion(chosen, points)
             rival = self._prediction(other, points, torch.zeros_like(margin))
             return self._prediction(chosen, points, margin, votes), rival
 
@@ -481,7 +493,19 @@ class PoseEstimator:
             found, _, margin = self._best(candidates)
             if dense is not None and self.two_ways.learnt:
                 found, _, margin = self._decided(found, points, dense, registers=True)
-            return self._prediction(found, points, margin)
+            return self._prediction(self._in_proportion(found, points), points, margin)
+
+    def _in_proportion(
+        self,
+        one: Hypotheses,  # H = 1
+        points: Tensor,  # [B, N, 3]
+    ) -> Hypotheses:  # H = 1
+        """Explanations in the proportions of complete clouds (`fit_proportions`), where parts turn."""
+        joint_type = one.structure.joint_type
+        if not self.inference.proportions or joint_type != REVOLUTE or not self.observation.bidirectional:
+            return one
+        category = self.articulated.category.articulated_shape(joint_type)
+        return fit_proportions(one, category, points, self.inference.proportions)
 
     def _refine(self, last: Iteration, points: Tensor, turn: Tensor | None) -> tuple[Hypotheses, Tensor]:
         """The leading hypotheses after articulated registration of the predicted shape, and their errors."""

@@ -52,10 +52,15 @@ def hinged(
         parts they are on.
     """
     chain = joints.chain
-    shift = {chain.root: center - torch.einsum("nij,j->ni", stretch[:, chain.root], center)}
+    shift = {chain.root: center - _mapped(stretch[:, chain.root], center)}
     pivots = []
-    for pivot, parent, child in zip(joints.pivot, chain.parent, chain.child, strict=True):
-        pivots.append(torch.einsum("nij,j->ni", stretch[:, parent], pivot) + shift[parent])
-        shift[child] = pivots[-1] - torch.einsum("nij,j->ni", stretch[:, child], pivot)
+    for pivot, parent, child in zip(joints.pivot.unbind(-2), chain.parent, chain.child, strict=True):
+        pivots.append(_mapped(stretch[:, parent], pivot) + shift[parent])
+        shift[child] = pivots[-1] - _mapped(stretch[:, child], pivot)
     maps = PartMaps(stretch, torch.stack([shift[part] for part in range(chain.num_parts)], dim=1))
     return maps, torch.stack(pivots, dim=1) if pivots else stretch.new_zeros(len(stretch), 0, 3)
+
+
+def _mapped(linear: Tensor, point: Tensor) -> Tensor:
+    """Points [3] or [n, 3] under linear maps [n, 3, 3]."""
+    return (linear @ point[..., None]).squeeze(-1)

@@ -94,7 +94,8 @@ def _with_rivals(module: ArticulatedPoseModule, clouds: Tensor, work: str) -> tu
     """Predictions and their rivals, no decision made."""
     shown = announced(log, work, clouds.split(_BATCH))
     points = _registered_points(module)
-    found = [module.estimator.predict_with_rivals(some[:, :points], module.num_points) for some in shown]
+    estimator, count = module.estimator, module.num_points
+    found = [estimator.predict_with_rivals(some[:, :points], count, fits=False) for some in shown]
     return tuple(concatenate(list(several)) for several in zip(*found, strict=True))
 
 

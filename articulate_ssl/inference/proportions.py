@@ -1,0 +1,47 @@
+"""Registration's last step: every part in the cloud's own proportions.
+
+Objects of a category differ in proportions, and the network's stretches say so only roughly. Where a part is longer or
+shorter than its shape, registration turns it to make up for that. So in the end pose, joint states, the stretch of
+every part and where its hinge is descend together, each cloud's on its own (`discovery.instance_fit`), to a smaller
+distance between cloud and shape. Parts stay hinged, axes stay as the network says.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from articulate_ssl.discovery.instance_fit import InstanceFit
+from articulate_ssl.network.heads.shape import CanonicalShape
+from articulate_ssl.network.hypotheses import Hypotheses
+from articulate_ssl.shape.articulated_shape import ArticulatedShape
+
+STEPS_A_CYCLE = 6  # of one rate of descent
+
+
+def fit_proportions(
+    one: Hypotheses,  # H = 1
+    category: ArticulatedShape,
+    points: Tensor,  # [B, N, 3] complete clouds
+    cycles: int,
+) -> Hypotheses:  # H = 1
+    """The category's shape in the proportions of clouds, from where explanations of them are.
+
+    Its points are the category's, as the network's own stretches and displacements of them say no more about which
+    part is where (docs/experiments.md, step 118); joint lines are those of the explanations.
+    """
+    # A test runs in inference mode, whose tensors no gradient goes through.
+    with torch.inference_mode(False):
+        lines = replace(category.joints, axis=one.axis[:, 0].clone(), pivot=one.pivot.clone())
+        shape = ArticulatedShape(category.points.clone(), category.label.clone(), lines)
+        generator = torch.Generator().manual_seed(0)
+        fit = InstanceFit(shape, one.base[:, 0].clone(), one.state[:, 0].clone(), generator)
+        fit.optimise(points.clone(), cycles, STEPS_A_CYCLE, shared=False)
+        instances = fit.instances()
+        parts = torch.stack([instances.part(part) for part in range(shape.num_parts)], dim=1)
+        center = parts.mean(dim=2)
+        own = CanonicalShape(parts - center[:, :, None], center)
+        structure = replace(one.structure, pivot=instances.joints.pivot)
+        return replace(one, shape=own, structure=structure).at(fit.base[:, None], fit.state[:, None])
