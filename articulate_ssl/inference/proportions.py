@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from articulate_ssl.discovery.instance_fit import InstanceFit
+from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.network.heads.shape import CanonicalShape
 from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
@@ -36,12 +37,14 @@ def fit_proportions(
     with torch.inference_mode(False):
         lines = replace(category.joints, axis=one.axis[:, 0].clone(), pivot=one.pivot.clone())
         shape = ArticulatedShape(category.points.clone(), category.label.clone(), lines)
-        generator = torch.Generator().manual_seed(0)
-        fit = InstanceFit(shape, one.base[:, 0].clone(), one.state[:, 0].clone(), generator)
-        fit.optimise(points.clone(), cycles, STEPS_A_CYCLE, shared=False)
+        # Seen in the object's frame, a cloud that is turned is descended on alike.
+        base = one.base[:, 0].clone()
+        seen, still = transform_points(invert_se3(base), points.clone()), torch.eye(4).to(base).expand_as(base)
+        fit = InstanceFit(shape, still, one.state[:, 0].clone(), torch.Generator().manual_seed(0))
+        fit.optimise(seen, cycles, STEPS_A_CYCLE, shared=False)
         instances = fit.instances()
         parts = torch.stack([instances.part(part) for part in range(shape.num_parts)], dim=1)
         center = parts.mean(dim=2)
         own = CanonicalShape(parts - center[:, :, None], center)
         structure = replace(one.structure, pivot=instances.joints.pivot)
-        return replace(one, shape=own, structure=structure).at(fit.base[:, None], fit.state[:, None])
+        return replace(one, shape=own, structure=structure).at((base @ fit.base)[:, None], fit.state[:, None])

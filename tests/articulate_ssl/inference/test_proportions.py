@@ -1,0 +1,114 @@
+"""Explanations take the proportions of their clouds: what that mends, and what it leaves alone."""
+
+from dataclasses import replace
+
+import pytest
+import roma
+import torch
+from articulated_objects import GLASSES, LAPTOP, OVEN, Clouds, clouds, true_shape
+from tiny import POINTS, tiny_module
+
+from articulate_ssl.discovery.registration import chamfer_l1, register_articulated
+from articulate_ssl.geometry.se3 import se3, transform_points
+from articulate_ssl.inference.pose_estimation import InferenceOptions
+from articulate_ssl.inference.proportions import fit_proportions
+from articulate_ssl.network.heads.shape import CanonicalShape
+from articulate_ssl.network.heads.structure import Structure
+from articulate_ssl.network.hypotheses import Hypotheses
+from articulate_ssl.shape.articulated_shape import ArticulatedShape
+from articulate_ssl.shape.observation import Observation
+
+CYCLES = 25
+
+
+def _category(design, data: Clouds) -> ArticulatedShape:
+    """The object of the clouds, part by part."""
+    shape = true_shape(design, data)
+    order = shape.label.argsort(stable=True)
+    return replace(shape, points=shape.points[order], label=shape.label[order])
+
+
+def _registered(shape: ArticulatedShape, data: Clouds) -> Hypotheses:
+    """As registration of the category's shape leaves clouds, started at the truth."""
+    base, state, _ = register_articulated(shape, data.points, data.base, data.state, (0.05, 0.02), 8)
+    count, joints = len(base), shape.joints
+    parts = torch.stack([shape.part(part) for part in range(shape.num_parts)])
+    center = parts.mean(dim=1)
+    pivot, axis = joints.pivot.expand(count, -1, -1), joints.axis.expand(count, 1, -1, -1)
+    return Hypotheses(
+        CanonicalShape(*(x.expand(count, *x.shape) for x in (parts - center[:, None], center))),
+        Structure(torch.zeros(count, 1), pivot, axis, pivot, axis, joints.chain, joints.joint_type),
+        base[:, None],
+        state[:, None],
+        torch.zeros(count, 0, shape.num_parts),
+    )
+
+
+def _error(one: Hypotheses, data: Clouds) -> torch.Tensor:
+    return chamfer_l1(data.points, one.posed()[:, 0].flatten(1, 2))
+
+
+@pytest.fixture(scope="module", params=[LAPTOP, OVEN, GLASSES], ids=["laptop", "oven", "glasses"])
+def fitted(request):
+    """Clouds of objects of other proportions, the explanations before, and after."""
+    data = clouds(request.param, count=10, points=600, resample=True, proportions=0.25)
+    shape = _category(request.param, data)
+    before = _registered(shape, data)
+    return data, before, fit_proportions(before, shape, data.points, CYCLES)
+
+
+def test_states_orientations_and_hinges_come_nearer_to_the_truth(fitted):
+    data, before, after = fitted
+    off = [(one.state[:, 0] - data.state).abs().mean() for one in (before, after)]
+    assert off[1] < 0.7 * off[0]
+    turned = [roma.rotmat_geodesic_distance(one.base[:, 0, :3, :3], data.base[:, :3, :3]) for one in (before, after)]
+    assert turned[1].mean() < turned[0].mean()
+    assert _error(after, data).mean() < 0.9 * _error(before, data).mean()
+
+
+def test_axes_stay_and_parts_stay_on_their_hinges(fitted):
+    _, before, after = fitted
+    assert torch.equal(after.axis, before.axis)
+    # Wherever the door is, both parts move the hinge to the same place.
+    pose, chain = after.object_pose()[:, 0], after.chain
+    for joint, (parent, child) in enumerate(zip(chain.parent, chain.child, strict=True)):
+        places = [transform_points(pose[:, part], after.pivot[:, joint, None]) for part in (parent, child)]
+        torch.testing.assert_close(*places, atol=1e-5, rtol=0)
+
+
+def test_a_cloud_that_is_turned_is_explained_alike_and_so_is_one_alone():
+    data = clouds(OVEN, count=4, points=400, resample=True, proportions=0.2)
+    shape = _category(OVEN, data)
+    start = _registered(shape, data)
+    every = fit_proportions(start, shape, data.points, 4)
+    alone = fit_proportions(start.rows(torch.tensor([2])), shape, data.points[2:3], 4)
+    torch.testing.assert_close(alone.state[0], every.state[2], atol=1e-4, rtol=0)
+    torch.testing.assert_close(alone.base[0], every.base[2], atol=1e-4, rtol=0)
+    turn = roma.rotvec_to_rotmat(torch.randn(4, 3, generator=torch.Generator().manual_seed(3)))
+    pose = se3(turn, torch.zeros(4, 3))
+    turned = fit_proportions(start.at(pose[:, None] @ start.base, start.state), shape, data.points @ turn.mT, 4)
+    torch.testing.assert_close(turned.state, every.state, atol=1e-3, rtol=0)
+    torch.testing.assert_close(turned.base, pose[:, None] @ every.base, atol=1e-3, rtol=0)
+
+
+def test_it_runs_in_inference_mode():
+    data = clouds(LAPTOP, count=2, points=200)
+    shape = _category(LAPTOP, data)
+    with torch.inference_mode():
+        data = Clouds(*(x.clone() for x in data))
+        after = fit_proportions(_registered(shape, data), shape, data.points, 1)
+    assert after.base.isfinite().all() and not after.base.requires_grad
+
+
+@pytest.mark.parametrize("view", ["complete", "depth"])
+def test_only_registered_complete_clouds_take_proportions(view):
+    module = tiny_module(inference=InferenceOptions(refine=True)).eval()
+    points = torch.rand(3, POINTS, 3, generator=torch.Generator().manual_seed(6)) - 0.5
+    module.estimator.observation = Observation(unidirectional=view == "depth")
+    own = module.estimator.predict(points, POINTS)
+    module.estimator.inference = replace(module.estimator.inference, proportions=0)
+    none = module.estimator.predict(points, POINTS)
+    assert torch.equal(own.part_shape, none.part_shape) == (view == "depth")
+    alone = module.estimator.predict(points, POINTS, refine=False)
+    module.estimator.inference = replace(module.estimator.inference, proportions=CYCLES)
+    assert torch.equal(module.estimator.predict(points, POINTS, refine=False).part_shape, alone.part_shape)
