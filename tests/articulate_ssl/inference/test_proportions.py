@@ -80,15 +80,16 @@ def test_a_cloud_that_is_turned_is_explained_alike_and_so_is_one_alone():
     data = clouds(OVEN, count=4, points=400, resample=True, proportions=0.2)
     shape = _category(OVEN, data)
     start = _registered(shape, data)
-    every = fit_proportions(start, shape, data.points, 4)
-    alone = fit_proportions(start.rows(torch.tensor([2])), shape, data.points[2:3], 4)
-    torch.testing.assert_close(alone.state[0], every.state[2], atol=1e-4, rtol=0)
-    torch.testing.assert_close(alone.base[0], every.base[2], atol=1e-4, rtol=0)
+    every = fit_proportions(start, shape, data.points, CYCLES)
+    alone = fit_proportions(start.rows(torch.tensor([2])), shape, data.points[2:3], CYCLES)
+    torch.testing.assert_close(alone.state[0], every.state[2], atol=5e-3, rtol=0)
+    torch.testing.assert_close(alone.base[0], every.base[2], atol=5e-3, rtol=0)
     turn = roma.rotvec_to_rotmat(torch.randn(4, 3, generator=torch.Generator().manual_seed(3)))
     pose = se3(turn, torch.zeros(4, 3))
-    turned = fit_proportions(start.at(pose[:, None] @ start.base, start.state), shape, data.points @ turn.mT, 4)
-    torch.testing.assert_close(turned.state, every.state, atol=1e-3, rtol=0)
-    torch.testing.assert_close(turned.base, pose[:, None] @ every.base, atol=1e-3, rtol=0)
+    turned = fit_proportions(start.at(pose[:, None] @ start.base, start.state), shape, data.points @ turn.mT, CYCLES)
+    # What is rounded otherwise, 150 steps of descent amplify to a tenth of a degree.
+    torch.testing.assert_close(turned.state, every.state, atol=5e-3, rtol=0)
+    torch.testing.assert_close(turned.base, pose[:, None] @ every.base, atol=5e-3, rtol=0)
 
 
 def test_it_runs_in_inference_mode():
