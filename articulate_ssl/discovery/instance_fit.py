@@ -126,11 +126,13 @@ class InstanceFit:
         steps: int = 6,
         shared: bool = True,
         keep: float = 1.0,
+        bidirectional: bool = True,
     ) -> None:
         """Descend for `cycles` times `steps` steps; with `shared`, also joint lines, and labels after every cycle.
 
         Args:
             keep: Share of the clouds, best fitted first, that count.
+            bidirectional: The clouds show all sides, so that each of the template's points must be near them, too.
         """
         own = [self._state, self._turn, self._shift, self._stretch]
         # In a frame that clouds have in common, what slides slides along one of its axes, exactly.
@@ -145,7 +147,7 @@ class InstanceFit:
             for _ in range(steps):
                 optimizer.zero_grad()
                 with torch.enable_grad():
-                    self._loss(clouds, keep).backward()
+                    self._loss(clouds, keep, bidirectional).backward()
                 optimizer.step()
                 self._state.data = self._shape.joints.clamped(self._state.data)
             if shared:
@@ -201,10 +203,12 @@ class InstanceFit:
         axis = functional.normalize(self._axis, dim=-1)
         return replace(self._shape.joints, axis=axis, pivot=self._pivot)
 
-    def _loss(self, clouds: Tensor, keep: float) -> Tensor:
+    def _loss(self, clouds: Tensor, keep: float, bidirectional: bool) -> Tensor:
         rows = self._draw(len(self._shape.label), clouds.device)
         posed, seen = self.posed(rows), clouds[:, self._draw(clouds.shape[1], clouds.device)]
-        error = _softened(_distance(posed, seen)).mean(dim=1) + _softened(_distance(seen, posed)).mean(dim=1)
+        error = _softened(_distance(seen, posed)).mean(dim=1)
+        if bidirectional:
+            error = _softened(_distance(posed, seen)).mean(dim=1) + error
         counts = error.detach() <= error.detach().quantile(keep)
         ridge = _RIDGE * (self._stretch.square().sum() + self._beside.square().sum())
         if self._start is not None:

@@ -110,9 +110,9 @@ class Handedness(nn.Module):
         self,
         seen: tuple[Prediction, Prediction],  # of clouds, and their rivals
         mirrored: tuple[Prediction, Prediction],  # of their mirror images
+        odds: Tensor,  # [B] logarithm of those of the latter
     ) -> tuple[Prediction, Prediction]:
         """Of each cloud the pair whose hand is likelier, with a margin that is no larger than that says."""
-        odds = self.log_odds(seen[0].reconstruction_error, mirrored[0].reconstruction_error)
         chosen, rival = (
             _either(odds > 0, self.mirrored_back(there), here) for here, there in zip(seen, mirrored, strict=True)
         )

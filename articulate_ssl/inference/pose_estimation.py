@@ -72,9 +72,8 @@ class InferenceOptions:
             closed laptop is shows in less than the spacing of the few points that suffice for the networks.
         candidates: Hypotheses that are refined; the best reconstruction wins.
         rounds: Rounds of registration.
-        proportions: Cycles of six steps of descent in which a complete cloud's explanation takes its own proportions
-            in the end (`proportions.py`); 0 leaves it to the network. Not where parts slide, whose places similar
-            clouds say.
+        proportions: Cycles of six steps of descent in which a cloud's explanation takes its own proportions in the end
+            (`proportions.py`); 0 leaves it to the network. Not where parts slide, whose places similar clouds say.
         most_turned: Degrees by which registration may turn a part from where the network put it; of a hypothesis that
             it turns further, the network's word stays. 180 lets it go anywhere. Where distances count one way, nothing
             in a cloud says that a hidden part is in the wrong place, but the network has seen where they are.
@@ -227,11 +226,12 @@ class PoseEstimator:
         """
         if not torch.isfinite(points).all():
             raise ValueError("a cloud has NaN or infinite points")
-        seen = self._explained(points, num_points, refine, dense, fits)
+        *seen, error = self._explained(points, num_points, refine, dense, fits)
         if not self.handedness.learnt:
-            return seen
+            return tuple(seen)
         dense = None if dense is None else in_the_mirror(dense)
-        return self.handedness.likelier(seen, self._explained(in_the_mirror(points), num_points, refine, dense, fits))
+        *other, mirrored = self._explained(in_the_mirror(points), num_points, refine, dense, fits)
+        return self.handedness.likelier(seen, other, self.handedness.log_odds(error, mirrored))
 
     @torch.no_grad()
     def mirror_errors(
@@ -240,13 +240,16 @@ class PoseEstimator:
         num_points: int,
     ) -> tuple[Tensor, Tensor]:  # [B], [B]
         """Errors of predictions, and of those of the clouds' mirror images, from which `handedness` learns."""
-        seen = (self._explained(some, num_points, None, None)[0] for some in (points, in_the_mirror(points)))
-        return tuple(prediction.reconstruction_error for prediction in seen)
+        seen = (points, in_the_mirror(points))
+        return tuple(self._explained(some, num_points, None, None, fits=False)[2] for some in seen)
 
     def _explained(
-        self, points: Tensor, num_points: int, refine: bool | None, dense: Tensor | None, fits: bool = True
-    ) -> tuple[Prediction, Prediction]:
-        """See `predict_with_rivals`: by the category's own hand."""
+        self, points: Tensor, num_points: int, refine: bool | None, dense: Tensor | None, fits: bool
+    ) -> tuple[Prediction, Prediction, Tensor]:
+        """See `predict_with_rivals`: by the category's own hand; and the errors [B] before proportions.
+
+        Proportions make up for the wrong hand.
+        """
         with torch.autocast(points.device.type, enabled=False):
             registers, votes = (self.inference.refine if refine is None else refine) is not False, None
             if registers and self.view_search.learnt:
@@ -259,10 +262,11 @@ class PoseEstimator:
                 chosen, other, margin = self._decided(chosen, points, dense, registers, self.two_ways.surface)
             elif dense is not None and self.two_ways.surface is not None:
                 chosen, other, margin = self._preferred(chosen, other, margin, points, dense, registers)
+            error = self._distance(chosen, points)
             if registers and fits:
                 chosen = self._in_proportion(chosen, points)
             rival = self._prediction(other, points, torch.zeros_like(margin))
-            return self._prediction(chosen, points, margin, votes), rival
+            return self._prediction(chosen, points, margin, votes), rival, error
 
     def _decided(
         self,
@@ -469,22 +473,23 @@ class PoseEstimator:
         range, and from the joint states where `StateRange` starts; 3 for one joint. Where parts slide, `sliding_search`
         takes the place of that, if there are dense clouds, and `view_search` where simulated views taught.
         """
-        seen = self._searched(points, dense)
+        seen, error = self._searched(points, dense)
         if not self.handedness.learnt:
             return seen
         dense = None if dense is None else in_the_mirror(dense)
-        mirrored = self._searched(in_the_mirror(points), dense)
-        return self.handedness.likelier((seen, seen), (mirrored, mirrored))[0]
+        other, mirrored = self._searched(in_the_mirror(points), dense)
+        return self.handedness.likelier((seen, seen), (other, other), self.handedness.log_odds(error, mirrored))[0]
 
-    def _searched(self, points: Tensor, dense: Tensor | None) -> Prediction:
-        """See `search`: by the category's own hand."""
+    def _searched(self, points: Tensor, dense: Tensor | None) -> tuple[Prediction, Tensor]:
+        """See `search`: by the category's own hand; and the errors [B] before proportions."""
         with torch.autocast(points.device.type, enabled=False):
             if self.view_search.learnt:
                 found, _, margin, votes = self._seen(points)
-                return self._prediction(found, points, margin, votes)
+                shown = self._in_proportion(found, points)
+                return self._prediction(shown, points, margin, votes), self._distance(found, points)
             if dense is not None and self.sliding.learnt:
                 found, _, margin, votes = self._slid(points, dense)
-                return self._prediction(found, points, margin, votes)
+                return self._prediction(found, points, margin, votes), self._distance(found, points)
             rotations = rotation_group(60).elements.to(points)
             rotations = rotations[self.observation.orientation.contains(rotations)]
             shape = self.articulated.category.articulated_shape(self.articulated.joint_type)
@@ -493,19 +498,28 @@ class PoseEstimator:
             found, _, margin = self._best(candidates)
             if dense is not None and self.two_ways.learnt:
                 found, _, margin = self._decided(found, points, dense, registers=True)
-            return self._prediction(self._in_proportion(found, points), points, margin)
+            shown = self._in_proportion(found, points)
+            return self._prediction(shown, points, margin), self._distance(found, points)
 
     def _in_proportion(
         self,
         one: Hypotheses,  # H = 1
         points: Tensor,  # [B, N, 3]
     ) -> Hypotheses:  # H = 1
-        """Explanations in the proportions of complete clouds (`fit_proportions`), where parts turn."""
+        """Explanations in the proportions of clouds (`fit_proportions`), where parts turn."""
         joint_type = one.structure.joint_type
-        if not self.inference.proportions or joint_type != REVOLUTE or not self.observation.bidirectional:
+        if not self.inference.proportions or joint_type != REVOLUTE:
             return one
         category = self.articulated.category.articulated_shape(joint_type)
-        return fit_proportions(one, category, points, self.inference.proportions)
+        return fit_proportions(one, category, points, self.inference.proportions, self.observation.bidirectional)
+
+    def _distance(
+        self,
+        one: Hypotheses,  # H = 1
+        points: Tensor,  # [B, N, 3]
+    ) -> Tensor:  # [B]
+        """Of explanations from their clouds."""
+        return chamfer(points, one.posed()[:, 0].flatten(1, 2), bidirectional=self.observation.bidirectional)
 
     def _refine(self, last: Iteration, points: Tensor, turn: Tensor | None) -> tuple[Hypotheses, Tensor]:
         """The leading hypotheses after articulated registration of the predicted shape, and their errors."""
@@ -582,7 +596,7 @@ class PoseEstimator:
             joint_state=chosen.state[:, 0],
             canonical_axis=chosen.axis[:, 0],
             canonical_pivot=chosen.pivot,
-            reconstruction_error=chamfer(points, posed.flatten(1, 2), bidirectional=self.observation.bidirectional),
+            reconstruction_error=self._distance(chosen, points),
             margin=margin,
         )
 

@@ -3,7 +3,8 @@
 Objects of a category differ in proportions, and the network's stretches say so only roughly. Where a part is longer or
 shorter than its shape, registration turns it to make up for that. So in the end pose, joint states, the stretch of
 every part and where its hinge is descend together, each cloud's on its own (`discovery.instance_fit`), to a smaller
-distance between cloud and shape. Parts stay hinged, axes stay as the network says.
+distance between cloud and shape. Parts stay hinged, axes stay as the network says. Where distances count one way, what a
+view hides pulls at nothing.
 """
 
 from __future__ import annotations
@@ -25,8 +26,9 @@ STEPS_A_CYCLE = 6  # of one rate of descent
 def fit_proportions(
     one: Hypotheses,  # H = 1
     category: ArticulatedShape,
-    points: Tensor,  # [B, N, 3] complete clouds
+    points: Tensor,  # [B, N, 3]
     cycles: int,
+    bidirectional: bool = True,
 ) -> Hypotheses:  # H = 1
     """The category's shape in the proportions of clouds, from where explanations of them are.
 
@@ -41,7 +43,7 @@ def fit_proportions(
         base = one.base[:, 0].clone()
         seen, still = transform_points(invert_se3(base), points.clone()), torch.eye(4).to(base).expand_as(base)
         fit = InstanceFit(shape, still, one.state[:, 0].clone(), torch.Generator().manual_seed(0))
-        fit.optimise(seen, cycles, STEPS_A_CYCLE, shared=False)
+        fit.optimise(seen, cycles, STEPS_A_CYCLE, shared=False, bidirectional=bidirectional)
         instances = fit.instances()
         parts = torch.stack([instances.part(part) for part in range(shape.num_parts)], dim=1)
         center = parts.mean(dim=2)

@@ -105,7 +105,8 @@ def test_the_likelier_hand_is_taken_cloud_by_cloud(handedness):
     seen, mirrored = (_prediction(REVOLUTE, torch.zeros(CLOUDS, 1)) for _ in range(2))
     seen = replace(seen, reconstruction_error=torch.tensor([1.0, 1.2, 1.0]), margin=torch.ones(3))
     mirrored = replace(mirrored, reconstruction_error=torch.tensor([1.2, 1.0, 0.98]), margin=torch.ones(3))
-    chosen, rival = handedness.likelier((seen, seen), (mirrored, mirrored))
+    odds = handedness.log_odds(seen.reconstruction_error, mirrored.reconstruction_error)
+    chosen, rival = handedness.likelier((seen, seen), (mirrored, mirrored), odds)
     back = handedness.mirrored_back(mirrored)
     # The third fits better in the mirror, but not by as much as so rare a hand takes.
     for i, expected in enumerate((seen, back, seen)):

@@ -101,15 +101,25 @@ def test_it_runs_in_inference_mode():
     assert after.base.isfinite().all() and not after.base.requires_grad
 
 
-@pytest.mark.parametrize("view", ["complete", "depth"])
-def test_only_registered_complete_clouds_take_proportions(view):
+@pytest.mark.parametrize("unidirectional", [False, True])
+def test_registered_clouds_take_proportions_and_what_the_network_says_alone_does_not(unidirectional):
     module = tiny_module(inference=InferenceOptions(refine=True)).eval()
     points = torch.rand(3, POINTS, 3, generator=torch.Generator().manual_seed(6)) - 0.5
-    module.estimator.observation = Observation(unidirectional=view == "depth")
-    own = module.estimator.predict(points, POINTS)
+    module.estimator.observation = Observation(unidirectional=unidirectional)
+    own, alone = (module.estimator.predict(points, POINTS, refine=refine) for refine in (True, False))
     module.estimator.inference = replace(module.estimator.inference, proportions=0)
-    none = module.estimator.predict(points, POINTS)
-    assert torch.equal(own.part_shape, none.part_shape) == (view == "depth")
-    alone = module.estimator.predict(points, POINTS, refine=False)
-    module.estimator.inference = replace(module.estimator.inference, proportions=CYCLES)
+    assert not torch.equal(module.estimator.predict(points, POINTS).part_shape, own.part_shape)
     assert torch.equal(module.estimator.predict(points, POINTS, refine=False).part_shape, alone.part_shape)
+
+
+def test_what_a_view_hides_pulls_at_nothing():
+    data = clouds(OVEN, count=6, points=600, resample=True, proportions=0.2)
+    shape = _category(OVEN, data)
+    start = _registered(shape, data)
+    # Three quarters of every oven, without its back.
+    own = torch.einsum("bij,bni->bnj", data.base[:, :3, :3], data.points - data.base[:, None, :3, 3])
+    front = own[..., 0].argsort(dim=1, descending=True)[:, :450]
+    seen = data.points.gather(1, front[..., None].expand(-1, -1, 3))
+    one, both = (fit_proportions(start, shape, seen, CYCLES, way) for way in (False, True))
+    back = [some.object_shape()[:, 0, :, 0].amin(dim=1) for some in (one, both)]
+    assert (back[1] > back[0]).all()  # where they pull, every body becomes shallower
