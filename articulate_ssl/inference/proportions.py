@@ -3,8 +3,8 @@
 Objects of a category differ in proportions, and the network's stretches say so only roughly. Where a part is longer or
 shorter than its shape, registration turns it to make up for that. So in the end pose, joint states, the stretch of
 every part and where its hinge is descend together, each cloud's on its own (`discovery.instance_fit`), to a smaller
-distance between cloud and shape. Parts stay hinged, axes stay as the network says. Where distances count one way, what a
-view hides pulls at nothing.
+distance between cloud and shape. Parts stay hinged, axes stay as the network says. Where distances count one way, what
+a view hides pulls at nothing.
 """
 
 from __future__ import annotations
