@@ -20,8 +20,6 @@ from articulate_ssl.network.heads.shape import CanonicalShape
 from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 
-STEPS_A_CYCLE = 6  # of one rate of descent
-
 
 def fit_proportions(
     one: Hypotheses,  # H = 1
@@ -43,7 +41,7 @@ def fit_proportions(
         base = one.base[:, 0].clone()
         seen, still = transform_points(invert_se3(base), points.clone()), torch.eye(4).to(base).expand_as(base)
         fit = InstanceFit(shape, still, one.state[:, 0].clone(), torch.Generator().manual_seed(0))
-        fit.optimise(seen, cycles, STEPS_A_CYCLE, shared=False, bidirectional=bidirectional)
+        fit.optimise(seen, cycles, shared=False, bidirectional=bidirectional)
         instances = fit.instances()
         parts = torch.stack([instances.part(part) for part in range(shape.num_parts)], dim=1)
         center = parts.mean(dim=2)
