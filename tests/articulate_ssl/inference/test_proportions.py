@@ -123,3 +123,17 @@ def test_what_a_view_hides_pulls_at_nothing():
     one, both = (fit_proportions(start, shape, seen, CYCLES, way) for way in (False, True))
     back = [some.object_shape()[:, 0, :, 0].amin(dim=1) for some in (one, both)]
     assert (back[1] > back[0]).all()  # where they pull, every body becomes shallower
+
+
+def test_hands_are_told_by_the_errors_before_proportions(monkeypatch):
+    module = tiny_module(inference=InferenceOptions(refine=True), orientation_range=60.0).eval()
+    estimator, hands = module.estimator, module.estimator.handedness
+    hands.learnt.fill_(True)
+    hands.slope.fill_(3.0)
+    points = torch.rand(3, POINTS, 3, generator=torch.Generator().manual_seed(6)) - 0.5
+    odds = []
+    monkeypatch.setattr(hands, "likelier", lambda seen, _mirrored, own: odds.append(own) or seen)
+    shown, _ = estimator.predict_with_rivals(points, POINTS)
+    before, mirrored = estimator.mirror_errors(points, POINTS)
+    torch.testing.assert_close(odds[0], hands.log_odds(before, mirrored))
+    assert (shown.reconstruction_error - before).abs().min() > 1e-4  # what is shown has proportions
