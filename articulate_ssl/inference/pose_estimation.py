@@ -13,7 +13,9 @@
 4. *Decision*, where a category's clouds can be explained in two ways that fit alike: the relief of the surface decides
    between the winner and its twin (`two_ways`), which is registered, too, if the winner was. Where fits tell them
    apart, a network that they taught decides between the winner and its rival (`surface_decision`).
-5. *Hand*, where upright cameras see objects and their mirror images: clouds are explained in a mirror, too, and how
+5. *Side*, where some doors are hinged at another side than most: frames are turned so that bodies look right
+   (`hinge_sides`).
+6. *Hand*, where upright cameras see objects and their mirror images: clouds are explained in a mirror, too, and how
    well either explains them decides (`handedness`).
 
 Training takes the first two steps too; nothing here knows a loss or an optimiser.
@@ -37,6 +39,7 @@ from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
 from articulate_ssl.inference.candidates import ANOTHER_WAY, Candidates, Iteration, rivals
 from articulate_ssl.inference.handedness import Handedness, in_the_mirror
+from articulate_ssl.inference.hinge_sides import HingeSides
 from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.inference.proportions import fit_proportions
 from articulate_ssl.inference.relief import NUM_FEATURES, describe_relief
@@ -115,6 +118,7 @@ class PoseEstimator:
         sliding: The search for parts that slide, if one was learnt; a module owns it.
         view_search: The search among simulated views, if there were any; a module owns it.
         handedness: Whether clouds show the category's mirror image, if some do; a module owns it.
+        hinge_sides: At which side objects are hinged, if not all at the same; a module owns it.
         states: Which joint states training clouds showed; a module owns it.
     """
 
@@ -136,6 +140,7 @@ class PoseEstimator:
         self.sliding = SlidingSearch(*articulated.category.template.shape[:2])
         self.view_search = ViewSearch(articulated.num_parts)
         self.handedness = Handedness()
+        self.hinge_sides = HingeSides()
         self.states = StateRange(articulated.num_parts - 1)
 
     def align(self, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -227,6 +232,10 @@ class PoseEstimator:
         if not torch.isfinite(points).all():
             raise ValueError("a cloud has NaN or infinite points")
         *seen, error = self._explained(points, num_points, refine, dense, fits)
+        if self.hinge_sides.learnt:
+            seen = [self.hinge_sides.counted_from_closed(one) for one in seen]
+            if dense is not None:
+                seen[0] = self.hinge_sides.decided(seen[0], dense)
         if not self.handedness.learnt:
             return tuple(seen)
         dense = None if dense is None else in_the_mirror(dense)

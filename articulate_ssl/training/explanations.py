@@ -60,8 +60,8 @@ def _learn_from_relief(module: ArticulatedPoseModule, clouds: Tensor) -> None:
     estimator, generator = module.estimator, torch.Generator().manual_seed(0)
     frames, reliefs, noisy_clouds = [], [], []
     for some in announced(log, "two explanations, their relief", clouds.split(_BATCH)):
-        noisy_clouds.append(_noisy(some, generator))
-        points = some[:, : _registered_points(module)]
+        noisy_clouds.append(with_noise(some, generator))
+        points = some[:, : registered_points(module)]
         both, described = estimator.reliefs(points, module.num_points, (some, noisy_clouds[-1]))
         frames.append(both)
         reliefs.append(described)
@@ -86,20 +86,20 @@ def _learn_from_fits(module: ArticulatedPoseModule, clouds: Tensor, chosen: Pred
     frames = frames.transpose(0, 1)
     rivalled = (frames[:, 0] != frames[:, 1]).flatten(1).any(dim=1).nonzero()[:, 0]
     order = rivalled[torch.randperm(len(rivalled), generator=generator).to(rivalled.device)]
-    noisy = torch.cat([_noisy(some, generator) for some in clouds.split(_BATCH)])
+    noisy = torch.cat([with_noise(some, generator) for some in clouds.split(_BATCH)])
     module.estimator.two_ways.surface = learn_surface((clouds, noisy), frames, order, _FITS_AGREE)
 
 
 def _with_rivals(module: ArticulatedPoseModule, clouds: Tensor, work: str) -> tuple[Prediction, Prediction]:
     """Predictions and their rivals, no decision made."""
     shown = announced(log, work, clouds.split(_BATCH))
-    points = _registered_points(module)
+    points = registered_points(module)
     estimator, count = module.estimator, module.num_points
     found = [estimator.predict_with_rivals(some[:, :points], count, fits=False) for some in shown]
     return tuple(concatenate(list(several)) for several in zip(*found, strict=True))
 
 
-def _registered_points(module: ArticulatedPoseModule) -> int:
+def registered_points(module: ArticulatedPoseModule) -> int:
     """How many leading points of a cloud are registered."""
     return max(module.num_points, module.inference.points)
 
@@ -110,14 +110,14 @@ def learn_handedness(
     clouds: Tensor,  # [n, N, 3] farthest-point order, of an upright camera
 ) -> None:
     """Find out whether some objects are mirror images of the others."""
-    estimator, network, count = module.estimator, module.articulated, _registered_points(module)
+    estimator, network, count = module.estimator, module.articulated, registered_points(module)
     shown = announced(log, "mirror images", clouds.split(_BATCH))
     errors = [estimator.mirror_errors(some[:, :count], module.num_points) for some in shown]
     axes = object_axes(network.category.articulated_shape(network.joint_type))
     estimator.handedness.learn(*(torch.cat(several) for several in zip(*errors, strict=True)), axes)
 
 
-def _noisy(clouds: Tensor, generator: torch.Generator) -> Tensor:
+def with_noise(clouds: Tensor, generator: torch.Generator) -> Tensor:
     """Clouds [B, P, 3] with noise, each of its own standard deviation."""
     sigma = _NOISE * torch.rand(len(clouds), 1, 1, generator=generator)
     return clouds + (sigma * torch.randn(clouds.shape, generator=generator)).to(clouds)

@@ -34,6 +34,7 @@ from articulate_ssl.ops.ranks import of_all_ranks
 from articulate_ssl.shape.observation import Observation
 from articulate_ssl.training.columns import TestColumns
 from articulate_ssl.training.explanations import learn_handedness, learn_two_ways
+from articulate_ssl.training.hinge_lessons import learn_hinge_sides
 from articulate_ssl.training.hub import HubWeights
 from articulate_ssl.training.label_free_report import LabelFreeReport
 from articulate_ssl.training.recipes import recipe_class
@@ -81,6 +82,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             none.
         handedness_samples: Training clouds of an upright camera from which it is learnt whether some objects are mirror
             images of the others (`inference.handedness`); 0 learns nothing of it.
+        hinge_sides_samples: Training clouds in any orientation from which it is learnt whether some objects are hinged
+            at another side than most (`inference.hinge_sides`); 0 learns nothing of it.
         orientation_range: How far objects are turned from their mean orientation at most, in degrees; 180 stands for
             any orientation, less where a camera is held upright.
 
@@ -104,6 +107,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         calibration_samples: int = 128,
         two_ways_samples: int = 2000,
         handedness_samples: int = 256,
+        hinge_sides_samples: int = 2000,
         orientation_range: float = 180.0,
     ) -> None:
         super().__init__()
@@ -121,6 +125,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         self.category, self.num_parts, self.schedule = category, num_parts, schedule
         self.inference, self.calibration_samples = inference, calibration_samples
         self.two_ways_samples, self.handedness_samples = two_ways_samples, handedness_samples
+        self.hinge_sides_samples = hinge_sides_samples
 
         self.articulated = ArticulatedNetwork(network, num_parts, JOINT_TYPES[joint_type], state_bound=state_range)
         self.rigid = RigidAlignment(network, num_parts * network.shape_points) if schedule.rigid_steps else None
@@ -131,7 +136,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         )
         self.two_ways, self.sliding = self.estimator.two_ways, self.estimator.sliding
         self.view_search, self.handedness = self.estimator.view_search, self.estimator.handedness
-        self.states = self.estimator.states
+        self.hinge_sides, self.states = self.estimator.hinge_sides, self.estimator.states
         self.recipe = recipe_type(self.estimator, objective, schedule, discovery)
         self.radius = RadiusStatistics()
         self.confidence = Confidence()
@@ -144,8 +149,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
 
     @property
     def state_range(self) -> Tensor:
-        """[J, 2] lowest and highest joint state in training, on average over batches."""
-        return self.states.limits
+        """[J, 2] lowest and highest joint state in training, on average over batches, as predictions count them."""
+        return self.states.limits - self.hinge_sides.closed * self.hinge_sides.learnt
 
     # Prediction
 
@@ -191,6 +196,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             learn_two_ways(self, self._training_clouds(self.two_ways_samples).to(self.device))
         if self.handedness_samples and self.orientation.limited:
             learn_handedness(self, self._training_clouds(self.handedness_samples).to(self.device))
+        if self.hinge_sides_samples and self.inference.refine and not self.orientation.limited:
+            learn_hinge_sides(self, self._training_clouds(self.hinge_sides_samples).to(self.device))
         clouds = self._training_clouds(self.calibration_samples).to(self.device)
         self.confidence.learn(*look_twice(self, clouds))
         self.train(training)
@@ -205,7 +212,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         """Adam; the category's shapes and joints are a group of their own."""
         shared = list(self.articulated.category.parameters())
         # What is learnt after the last step is not trained with the rest, nor when a run that ended goes on.
-        elsewhere = set(map(id, (*shared, *self.two_ways.parameters())))
+        elsewhere = set(map(id, (*shared, *self.two_ways.parameters(), *self.hinge_sides.parameters())))
         others = [p for p in self.parameters() if id(p) not in elsewhere]
         optimizer = torch.optim.Adam(
             [{"params": others}, {"params": shared}], lr=self.schedule.learning_rate, betas=(0.9, 0.999), eps=1e-8

@@ -41,12 +41,12 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Lessons:
-    """Clouds of which it is known which of two frames is right.
+    """Clouds of which it is known which of two or more frames is right.
 
     Attributes:
         points: [V, n, N, 3] V versions of each cloud: as it is, with noise.
         surface: [V, n, N, SPIN_CHANNELS + 3] float16, spin images and normals.
-        frames: [n, 2, 3, 3] the right one first.
+        frames: [n, S, 3, 3] the right one first.
     """
 
     points: Tensor
@@ -68,7 +68,7 @@ class Lessons:
         return Lessons(dense[:, :count].unflatten(0, ways), torch.cat(surface).unflatten(0, ways), frames)
 
     def draw(self, count: int, read: int, generator: torch.Generator) -> tuple[SurfaceCloud, Tensor]:
-        """Some of the clouds, in versions and of points drawn anew; and their frames."""
+        """Some of the clouds, in versions and of points drawn anew; and the right and a wrong frame of each."""
         versions, clouds, shown, _ = self.points.shape
         chosen = torch.randperm(clouds, generator=generator)[:count, None]
         version = torch.randint(versions, chosen.shape, generator=generator)
@@ -76,7 +76,11 @@ class Lessons:
         seen = torch.rand(len(chosen), shown, generator=generator).argsort(dim=1)[:, :read].sort(dim=1).values
         points, surface = (x[version, chosen, seen].to(self.points) for x in (self.points, self.surface))
         images, normal = surface.split([SPIN_CHANNELS, 3], dim=-1)
-        return SurfaceCloud.of(points, images, normal, SIZE), self.frames[chosen[:, 0]]
+        frames = self.frames[chosen[:, 0]]
+        if frames.shape[1] > 2:
+            wrong = torch.randint(1, frames.shape[1], (len(frames),), generator=generator)
+            frames = torch.stack([frames[:, 0], frames[torch.arange(len(frames)), wrong]], dim=1)
+        return SurfaceCloud.of(points, images, normal, SIZE), frames
 
 
 def learn_surface(
@@ -111,8 +115,8 @@ def learn_surface(
     return decision
 
 
-def teach(lessons: Lessons) -> SurfaceDecision:
-    """A new network that has learnt them."""
+def teach(lessons: Lessons, work: str = "a network learns to decide") -> SurfaceDecision:
+    """A new network that has learnt them; `work` is what progress is called."""
     device = lessons.points.device
     generator = torch.Generator().manual_seed(0)
     steps = math.ceil(TIMES * lessons.points.shape[1] / BATCH)
@@ -121,7 +125,7 @@ def teach(lessons: Lessons) -> SurfaceDecision:
         decision = SurfaceDecision(SIZE).to(device)
         optimizer = torch.optim.AdamW(decision.parameters(), lr=RATE, weight_decay=_DECAY)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
-        for _ in announced(log, "a network learns to decide", range(steps)):
+        for _ in announced(log, work, range(steps)):
             cloud, frames = lessons.draw(BATCH, SIZE.read, generator)
             one, other = (
                 decision.seen(_varied(cloud.seen_in(_turned(frames, generator)), generator)).view(-1, 2).unbind(1)

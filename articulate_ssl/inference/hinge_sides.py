@@ -1,0 +1,237 @@
+"""Boxes whose door is hinged at another side than that of most objects: ovens at the side, safes on the right.
+
+A category has one joint. An oven that is hinged at its side is explained as well by one that lies on its side, hinged
+below, and only the body tells which it is. So of a prediction everything in camera space stays, and its frame is turned
+about the door's normal, by a quarter or half a turn, if the body looks as those of most objects do when it is seen so.
+
+A network says how right the body looks (`surface_decision`). It learns that from predictions, most of which are right,
+and without labels; the few that are wrong it would learn as well, if it could tell by anything where the hinge is. So
+it sees nothing of that: frames are each cloud's own axes at right angles (`manhattan_frame`), which differ by exact
+quarter turns, and of the points only those of the body that lie behind the door's plane.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import roma
+import torch
+from scipy.spatial import ConvexHull
+from torch import Tensor, nn
+
+from articulate_ssl.discovery.manhattan_frame import manhattan_frames
+from articulate_ssl.geometry.rotation_group import rotation_group
+from articulate_ssl.geometry.screw import REVOLUTE, screw_motion
+from articulate_ssl.geometry.se3 import invert_se3, transform_points
+from articulate_ssl.inference.prediction import Prediction
+from articulate_ssl.inference.surface_decision import LOOKS, SIZE, SurfaceDecision
+from articulate_ssl.network.surface_network import SurfaceCloud
+from articulate_ssl.ops.chamfer import nearest_distance
+from articulate_ssl.ops.spin_images import SPIN_CHANNELS, spin_images
+from articulate_ssl.shape.articulated_shape import ArticulatedShape
+from articulate_ssl.shape.object_axes import object_axes
+
+TURNS = 4  # quarter turns: sides that a door may be hinged at
+SHOWN = LOOKS * SIZE.read  # points of a body that are known
+# Behind the closed door's plane, in normalised units. Nearer, door and body are not told apart well enough to hide
+# where the hinge is: with .04 fewer are found (docs/experiments.md, step 124).
+_BEHIND = 0.12
+_CLOSED_REACH = math.radians(120)  # from the middle of the joint's range: the closed door is not farther. Chosen.
+
+
+class Bodies(NamedTuple):
+    """What is seen of B bodies, in V versions of their clouds, without their doors.
+
+    Attributes:
+        points: [V, B, SHOWN, 3] camera space.
+        surface: [V, B, SHOWN, SPIN_CHANNELS + 3] spin images and normals, in float16.
+        frames: [B, TURNS, 3, 3] frame -> camera: of the box as it is predicted, hinge first and door's normal last, and
+            the same turned about the latter by one, two and three quarters.
+        known: [B] whether enough of the body is seen.
+    """
+
+    points: Tensor
+    surface: Tensor
+    frames: Tensor
+    known: Tensor
+
+
+class HingeSides(nn.Module):
+    """At which side objects are hinged, in quarter turns about the door's normal from where most are.
+
+    Attributes:
+        learnt: [] whether some objects are hinged elsewhere. Then joint states count from the closed door.
+        closed: [] joint state at which the door is closed, of predictions before.
+        axes: [3, 3] columns: of the object's box in canonical space, the door's normal last, pointing at the body.
+        door: [3] canonical space, the middle of the closed door.
+        log_prior: [TURNS] logarithm of the share of objects that are to be turned so.
+        surface: How right a body looks.
+    """
+
+    surface: SurfaceDecision | None
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("learnt", torch.tensor(False))
+        self.register_buffer("closed", torch.tensor(0.0))
+        self.register_buffer("axes", torch.eye(3))
+        self.register_buffer("door", torch.zeros(3))
+        self.register_buffer("log_prior", torch.zeros(TURNS))
+        self.register_module("surface", None)
+
+    def measure(self, shape: ArticulatedShape, state_range: Tensor) -> None:
+        """Find axes and the closed door of a category's shape with one joint.
+
+        Args:
+            state_range: [1, 2] joint states that were seen.
+        """
+        root, child = shape.joints.chain.root, shape.joints.chain.child[0]
+        axes, own = object_axes(shape), _box_axes(shape, child)
+        hinge, one, other = axes[:, 0], own[:, 1], axes[:, 1]
+        # A closed door is square to its body, and the whole is small.
+        square = math.atan2(float(torch.linalg.cross(one, other) @ hinge), float(one @ other))
+        states = [square + k * math.pi / 2 for k in range(-8, 9)]
+        states = [state for state in states if abs(state - float(state_range.mean())) <= _CLOSED_REACH]
+
+        def volume(state: float) -> float:
+            whole = torch.cat([shape.part(root), _at(shape, child, state)])
+            return ConvexHull(whole.double().cpu().numpy()).volume
+
+        closed = min(states, key=volume)
+        door = _at(shape, child, closed)
+        middle, extent = (
+            (door.amax(dim=0) + door.amin(dim=0)) / 2,
+            (door @ axes).amax(dim=0) - (door @ axes).amin(dim=0),
+        )
+        normal = axes[:, 1 + int(extent[1:].argmin())]
+        normal = normal * ((shape.part(root).mean(dim=0) - middle) @ normal).sign()
+        self.closed.fill_(closed)
+        self.axes.copy_(torch.stack([hinge, torch.linalg.cross(normal, hinge), normal], dim=1))
+        self.door.copy_(middle)
+
+    def counted_from_closed(self, prediction: Prediction) -> Prediction:
+        """The same with joint states that count from the closed door, where all parts are turned as the object is.
+
+        So frames of parts mean the same whichever side the door is hinged at.
+        """
+        closed = self.closed.to(prediction.joint_state)
+        motion = screw_motion(prediction.canonical_axis, prediction.canonical_pivot, closed, REVOLUTE)[:, 0]
+        child, back = int(prediction.joint_child[0, 0]), motion[:, :3, :3].mT
+        pose, shape, assembly = (x.clone() for x in (prediction.part_pose, prediction.part_shape, prediction.assembly))
+        pose[:, child, :3, :3] = pose[:, child, :3, :3] @ back
+        shape[:, child] = shape[:, child] @ back
+        assembly[:, child] = transform_points(motion, assembly[:, child, None])[:, 0]
+        state = prediction.joint_state - closed
+        return replace(prediction, part_pose=pose, part_shape=shape, assembly=assembly, joint_state=state)
+
+    def decided(
+        self,
+        prediction: Prediction,  # joint states count from the closed door
+        dense: Tensor,  # [B, P, 3]
+    ) -> Prediction:
+        """The same, its frame turned so that the body looks right; its margin is at most how sure that is."""
+        bodies = self.bodies(prediction, dense, (dense,))
+        odds = (self.looks_right(bodies) + self.log_prior.to(dense)) * bodies.known[:, None]
+        best, turns = odds.topk(2, dim=1)
+        sure = torch.where(bodies.known, (best[:, 0] - best[:, 1]) / 2, torch.inf).tanh()
+        quarters = torch.where(bodies.known, turns[:, 0], 0)
+        turned = turned_about(prediction, bodies.frames[:, 0, :, 2], quarters)
+        return replace(turned, margin=prediction.margin.minimum(sure))
+
+    def looks_right(self, bodies: Bodies) -> Tensor:  # [B, TURNS]
+        """How right bodies look, as they are, in each of their frames."""
+        looks = []
+        for first in range(LOOKS):
+            points, surface = (x[0, :, first::LOOKS].to(bodies.frames) for x in bodies[:2])
+            images, normal = surface.split([SPIN_CHANNELS, 3], dim=-1)
+            seen = SurfaceCloud.of(points, images, normal, SIZE).seen_in(bodies.frames)
+            looks.append(self.surface.seen(seen).unflatten(0, (-1, TURNS)))
+        return torch.stack(looks).mean(dim=0)
+
+    def bodies(
+        self,
+        prediction: Prediction,
+        dense: Tensor,  # [B, P, 3] farthest-point order
+        versions: Sequence[Tensor],  # of [B, P, 3] the same points, as they are or with noise
+    ) -> Bodies:
+        """What is seen of clouds' bodies."""
+        axes = manhattan_frames(dense, torch.Generator().manual_seed(0))[0].mT
+        every = axes[:, None] @ rotation_group(24).elements.to(axes)  # the same axes in every order
+        said = prediction.base_pose[:, :3, :3] @ self.axes.to(axes)
+        nearest = (every * said[:, None]).sum(dim=(-2, -1)).argmax(dim=1)
+        box = every[torch.arange(len(every), device=every.device), nearest]
+        quarter = torch.tensor([0.0, 0.0, math.pi / 2]).to(box) * torch.arange(TURNS).to(box)[:, None]
+        frames = box[:, None] @ roma.rotvec_to_rotmat(quarter)
+
+        door = transform_points(prediction.base_pose, self.door.to(axes).expand(len(axes), 1, 3))
+        behind = ((dense - door) @ box[:, :, 2, None]).squeeze(-1) > _BEHIND
+        posed = [transform_points(prediction.part_pose[:, k], prediction.part_shape[:, k]) for k in range(2)]
+        to_part = torch.stack([nearest_distance(dense, part) for part in posed], dim=-1)
+        own = behind & (to_part.argmin(dim=-1) == int(prediction.joint_parent[0, 0]))
+        known = own.sum(dim=1) >= SHOWN
+        own |= ~known[:, None]  # of these nothing is decided
+        described = [_described(version, own) for version in versions]
+        points, surface = (torch.stack(some) for some in zip(*described, strict=True))
+        return Bodies(points, surface, frames, known)
+
+    def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
+        """Weights from before know of no other sides, and a network only those that were taught one."""
+        taught = any(name.startswith(f"{prefix}surface.") for name in state_dict)
+        self.surface = (self.surface or SurfaceDecision().to(self.axes).requires_grad_(False)) if taught else None
+        for name, value in self.named_buffers(recurse=False):
+            state_dict.setdefault(prefix + name, value.clone())
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+
+def turned_about(
+    prediction: Prediction,
+    normal: Tensor,  # [B, 3] unit, camera space
+    quarters: Tensor,  # [B]
+) -> Prediction:
+    """The same parts and joints in camera space, in a frame turned by quarters about the normal through the root."""
+    rows = torch.arange(len(normal), device=normal.device)
+    middle = prediction.part_pose[rows, prediction.joint_parent[:, 0], :3, 3]
+    base = screw_motion(normal, middle, (quarters * (math.pi / 2)).to(normal), REVOLUTE) @ prediction.base_pose
+    # From the old canonical space to the new one.
+    change = invert_se3(base) @ prediction.base_pose
+    turn = change[:, :3, :3]
+    pose = prediction.part_pose.clone()
+    pose[..., :3, :3] = pose[..., :3, :3] @ turn[:, None].mT
+    return replace(
+        prediction,
+        base_pose=base,
+        part_pose=pose,
+        part_shape=torch.einsum("bij,bkmj->bkmi", turn, prediction.part_shape),
+        assembly=transform_points(change, prediction.assembly),
+        canonical_axis=prediction.canonical_axis @ turn.mT,
+        canonical_pivot=transform_points(change, prediction.canonical_pivot),
+    )
+
+
+def _described(
+    clouds: Tensor,  # [B, P, 3]
+    own: Tensor,  # [B, P] bool, at least SHOWN of each
+) -> tuple[Tensor, Tensor]:  # [B, SHOWN, 3], [B, SHOWN, SPIN_CHANNELS + 3]
+    """The leading points of the bodies, and their surface as it is without the doors."""
+    points, surface = [], []
+    for cloud, mine in zip(clouds, own, strict=True):
+        body = cloud[None, mine]
+        points.append(body[:, :SHOWN])
+        surface.append(torch.cat(spin_images(points[-1], body), dim=-1).half())
+    return torch.cat(points), torch.cat(surface)
+
+
+def _box_axes(shape: ArticulatedShape, part: int) -> Tensor:
+    """As `object_axes` has them of the root: of the smallest box about a part that has the hinge for an edge."""
+    chain = shape.joints.chain
+    return object_axes(replace(shape, joints=replace(shape.joints, chain=replace(chain, root=part))))
+
+
+def _at(shape: ArticulatedShape, part: int, state: float) -> Tensor:
+    """A part's points [m, 3] in canonical space, moved by its joint."""
+    still = torch.eye(4).to(shape.points)[None]
+    pose = shape.joints.part_pose(still, torch.tensor([[state]]).to(shape.points))
+    return transform_points(pose[0, part], shape.part(part))
