@@ -1,0 +1,288 @@
+"""A box that lies on its side stands up: its parts and joint stay where they are, its frame turns."""
+
+import math
+
+import pytest
+import roma
+import torch
+from tiny import POINTS, tiny_module
+
+from articulate_ssl.geometry.kinematic_chain import KinematicChain
+from articulate_ssl.geometry.screw import REVOLUTE, screw_motion
+from articulate_ssl.geometry.se3 import se3, transform_points
+from articulate_ssl.inference.hinge_sides import SHOWN, TURNS, Bodies, HingeSides, turned_about
+from articulate_ssl.inference.prediction import Prediction
+from articulate_ssl.inference.surface_decision import SurfaceDecision
+from articulate_ssl.shape.articulated_shape import ArticulatedShape
+from articulate_ssl.shape.joints import Joints
+from articulate_ssl.training import hinge_lessons
+from articulate_ssl.training.hinge_lessons import learn_hinge_sides
+
+QUARTER = math.pi / 2
+ZERO = -1.9  # joint state at which the door is closed
+HINGE, PIVOT = torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, -0.3, -0.26])
+BODY, DOOR = torch.tensor([0.6, 0.6, 0.5]), torch.tensor([0.6, 0.6, 0.02])
+
+
+def _on_box(size: torch.Tensor, count: int, generator: torch.Generator) -> torch.Tensor:
+    """Points [count, 3] on the surface of a box about the origin."""
+    points = torch.rand(count, 3, generator=generator) - 0.5
+    side = torch.arange(count) % 3
+    rows = torch.arange(count)
+    points[rows, side] = points[rows, side].sign() / 2
+    return points * size
+
+
+def _parts(generator: torch.Generator, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Points of the body, with something on its top (+y), and of the closed door at its front (-z)."""
+    top = torch.tensor([0.0, 0.34, 0.1]) + _on_box(torch.tensor([0.3, 0.08, 0.2]), count // 5, generator)
+    body = torch.cat([_on_box(BODY, count - count // 5, generator), top])
+    return body, _on_box(DOOR, count // 3, generator) + torch.tensor([0.0, 0.0, -0.26])
+
+
+def _shape() -> ArticulatedShape:
+    body, door = _parts(torch.Generator().manual_seed(0), 600)
+    opened = screw_motion(HINGE, PIVOT, torch.tensor(-ZERO), REVOLUTE)
+    points = torch.cat([body, transform_points(opened, door)])
+    label = torch.tensor([0] * len(body) + [1] * len(door))
+    joints = Joints(KinematicChain(2, 0, (0,), (1,)), HINGE[None], PIVOT[None], REVOLUTE)
+    return ArticulatedShape(points, label, joints)
+
+
+def _sides() -> HingeSides:
+    sides = HingeSides()
+    # Seen in training with the door open by 50 to 100 degrees.
+    sides.measure(_shape(), torch.tensor([[ZERO + 0.9, ZERO + 1.8]]))
+    return sides
+
+
+class _TopIsUp(torch.nn.Module):
+    """Looks right to it what has more above: its mean, where points count from, is nearer to its upper end."""
+
+    def seen(self, cloud):
+        up = cloud.points[..., 1]
+        return -2000 * (up.amax(dim=1) + up.amin(dim=1))
+
+
+def _lying(
+    quarters: list[int],  # by which the frame of each of B objects is to be turned
+    opened: float = 1.2,
+) -> tuple[Prediction, torch.Tensor, torch.Tensor]:
+    """Predictions by the one joint there is, dense clouds, and the true rotations canonical -> camera."""
+    generator, shape = torch.Generator().manual_seed(3), _shape()
+    count = len(quarters)
+    body, door = _parts(generator, 3000)
+    base = se3(roma.random_rotmat(count), torch.rand(count, 3, generator=generator))
+    state = torch.full((count, 1), ZERO + opened)
+    sides = _sides()
+    turn = roma.rotvec_to_rotmat(torch.tensor(quarters)[:, None] * QUARTER * sides.axes[:, 2])
+    motion = screw_motion(HINGE, PIVOT, torch.tensor(opened), REVOLUTE)
+    dense = torch.cat([body @ turn.mT, transform_points(motion, door).expand(count, -1, -1)], dim=1)
+    dense = transform_points(base, dense[:, torch.randperm(dense.shape[1], generator=generator)])
+    rest = shape.points.view(1, -1, 3)
+    parts = [rest[:, shape.label == k][:, :200].expand(count, -1, -1) for k in range(2)]
+    center = torch.stack([part.mean(dim=1) for part in parts], dim=1)
+    pose = shape.joints.part_pose(base, state)
+    part_pose = pose.clone()
+    part_pose[..., :3, 3] = transform_points(pose, center[:, :, None])[:, :, 0]
+    line = torch.zeros(count, 1, dtype=torch.long)
+    prediction = Prediction(
+        part_id=torch.zeros(count, 4, dtype=torch.long),
+        part_probability=torch.ones(count, 4, 2) / 2,
+        part_pose=part_pose,
+        part_shape=torch.stack(parts, dim=1) - center[:, :, None],
+        assembly=center,
+        base_pose=base,
+        joint_parent=line,
+        joint_child=line + 1,
+        joint_type=line,
+        joint_axis=(base[:, None, :3, :3] @ HINGE[:, None]).squeeze(-1),
+        joint_pivot=transform_points(base, PIVOT.expand(count, 1, 3)),
+        joint_state=state,
+        canonical_axis=HINGE.expand(count, 1, 3),
+        canonical_pivot=PIVOT.expand(count, 1, 3),
+        reconstruction_error=torch.ones(count),
+        margin=torch.ones(count),
+    )
+    return prediction, dense, base[:, :3, :3] @ turn
+
+
+def _posed(prediction: Prediction) -> torch.Tensor:
+    return transform_points(prediction.part_pose, prediction.part_shape)
+
+
+def _holds(prediction: Prediction) -> None:
+    """Base, canonical joint and state pose the parts, and the joint in camera space is the canonical one."""
+    base, line = prediction.base_pose, (prediction.canonical_axis, prediction.canonical_pivot)
+    motion = screw_motion(*line, prediction.joint_state, REVOLUTE)[:, 0]
+    pose = torch.stack([base, base @ motion], dim=1)
+    whole = transform_points(pose, prediction.part_shape + prediction.assembly[:, :, None])
+    torch.testing.assert_close(whole, _posed(prediction), atol=1e-5, rtol=0)
+    axis = (base[:, None, :3, :3] @ prediction.canonical_axis[..., None]).squeeze(-1)
+    torch.testing.assert_close(axis, prediction.joint_axis, atol=1e-5, rtol=0)
+    torch.testing.assert_close(transform_points(base, line[1]), prediction.joint_pivot, atol=1e-5, rtol=0)
+
+
+def _same_in_camera_space(one: Prediction, other: Prediction) -> None:
+    torch.testing.assert_close(_posed(one), _posed(other), atol=1e-5, rtol=0)
+    for name in ("joint_axis", "joint_pivot", "part_id"):
+        torch.testing.assert_close(getattr(one, name), getattr(other, name))
+
+
+def test_the_closed_door_is_square_to_the_body_and_near_it():
+    sides = _sides()
+    assert float(sides.closed) == pytest.approx(ZERO, abs=0.02)
+    torch.testing.assert_close(sides.axes[:, 2], torch.tensor([0.0, 0.0, 1.0]), atol=0.03, rtol=0)
+    torch.testing.assert_close(sides.door, torch.tensor([0.0, 0.0, -0.26]), atol=0.02, rtol=0)
+    assert float(torch.linalg.det(sides.axes)) == pytest.approx(1, abs=1e-4)
+
+
+def test_states_count_from_the_closed_door():
+    prediction, _, _ = _lying([0, 1, 2])
+    counted = _sides().counted_from_closed(prediction)
+    _same_in_camera_space(counted, prediction)
+    _holds(counted)
+    torch.testing.assert_close(counted.joint_state, torch.full((3, 1), 1.2), atol=0.02, rtol=0)
+    closed = _sides().counted_from_closed(_lying([0], opened=0.0)[0])
+    turned = roma.rotmat_geodesic_distance(closed.part_pose[:, 0, :3, :3], closed.part_pose[:, 1, :3, :3])
+    assert float(turned) < 0.02
+
+
+def test_a_turned_frame_leaves_everything_where_it_is():
+    prediction, _, _ = _lying([0, 1, 2, 3])
+    normal = prediction.base_pose[:, :3, 2]
+    turned = turned_about(prediction, normal, torch.arange(4))
+    _same_in_camera_space(turned, prediction)
+    _holds(turned)
+    angle = roma.rotmat_geodesic_distance(turned.base_pose[:, :3, :3], prediction.base_pose[:, :3, :3])
+    torch.testing.assert_close(angle, torch.tensor([0, QUARTER, math.pi, QUARTER]), atol=2e-3, rtol=0)
+    assert torch.equal(turned.joint_state, prediction.joint_state)
+
+
+def test_a_lying_object_stands_up():
+    prediction, dense, true = _lying([0, 1, 2, 3])
+    sides = _sides()
+    sides.surface = _TopIsUp()
+    decided = sides.decided(sides.counted_from_closed(prediction), dense)
+    _same_in_camera_space(decided, prediction)
+    _holds(decided)
+    off = roma.rotmat_geodesic_distance(decided.base_pose[:, :3, :3], true).rad2deg()
+    assert off.max() < 2
+    # Rarely seen sides take more to be believed.
+    sides.log_prior.copy_(torch.tensor([0.0, -1e3, -1e3, -1e3]))
+    kept = sides.decided(sides.counted_from_closed(prediction), dense)
+    torch.testing.assert_close(kept.base_pose, prediction.base_pose)
+
+
+def test_nothing_seen_of_a_body_says_where_its_door_is():
+    """However wide it is open, and although the prediction is tilted: frames are square to the box, points its own."""
+    sides = _sides()
+    seen = []
+    for opened in (0.3, 1.2, 2.2):
+        torch.manual_seed(0)
+        prediction, dense, true = _lying([0], opened)
+        tilt = se3(roma.rotvec_to_rotmat(torch.tensor([[0.12, 0.05, -0.06]])), torch.zeros(1, 3))
+        prediction = turned_about(prediction, prediction.base_pose[:, :3, 2], torch.zeros(1))
+        tilted = Prediction(**{**prediction.__dict__, "base_pose": prediction.base_pose @ tilt})
+        bodies = sides.bodies(tilted, dense, (dense, dense + 0.001))
+        assert bodies.known.all() and bodies.points.shape == (2, 1, SHOWN, 3)
+        own = (bodies.points[0, 0] - prediction.base_pose[0, :3, 3]) @ prediction.base_pose[0, :3, :3]
+        assert own[:, 2].min() > -0.26 + 0.05  # behind the door's plane, and none of an open door before it
+        assert own[:, :2].abs().amax() < 0.39
+        square = (true[0].T @ bodies.frames[0]).abs()
+        assert (square.amax(dim=-1) > 0.999).all()
+        quarter = bodies.frames[0, :-1].mT @ bodies.frames[0, 1:]
+        expected = roma.rotvec_to_rotmat(torch.tensor([0.0, 0.0, QUARTER])).expand(TURNS - 1, 3, 3)
+        torch.testing.assert_close(quarter, expected, atol=1e-5, rtol=0)
+        seen.append(bodies.frames)
+    torch.testing.assert_close(bodies.points[1], bodies.points[0] + 0.001, atol=1e-6, rtol=0)
+
+
+def test_where_too_little_is_behind_the_door_nothing_is_decided():
+    prediction, dense, _ = _lying([1, 1])
+    sides = _sides()
+    sides.surface = _TopIsUp()
+    few = dense[:, :700]
+    kept = sides.decided(prediction, few)
+    torch.testing.assert_close(kept.base_pose, prediction.base_pose)
+    assert torch.equal(kept.margin, prediction.margin)
+
+
+@pytest.fixture
+def box_module(monkeypatch):
+    """A module whose bodies are drawn: sixty clouds in a hundred stand, and `_TopIsUp` is all that it ever learns."""
+    module = tiny_module(num_parts=2).eval()
+    monkeypatch.setattr(hinge_lessons, "FEWEST", 20)
+    monkeypatch.setattr(hinge_lessons, "teach", lambda *_: _TopIsUp())
+    return module
+
+
+def _drawn(quarters: torch.Tensor) -> Bodies:
+    body = _parts(torch.Generator().manual_seed(0), 3000)[0]
+    body = body[torch.randperm(len(body), generator=torch.Generator().manual_seed(1))[:SHOWN]]
+    axes = _sides().axes
+    turn = roma.rotvec_to_rotmat(quarters[:, None] * QUARTER * axes[:, 2])
+    points = (body @ turn.mT)[None]
+    steps = roma.rotvec_to_rotmat(torch.arange(TURNS)[:, None] * torch.tensor([0.0, 0.0, QUARTER]))
+    surface = torch.zeros(*points.shape[:-1], 37, dtype=torch.float16)
+    return Bodies(points, surface, (axes @ steps).expand(len(quarters), -1, -1, -1), torch.ones(len(quarters)) > 0)
+
+
+@pytest.mark.parametrize(("share", "learnt"), [(0.12, True), (0.0, False), (0.6, False)], ids=["some", "none", "most"])
+def test_some_that_lie_are_learnt(box_module, monkeypatch, share, learnt):
+    quarters = torch.where(torch.rand(200, generator=torch.Generator().manual_seed(2)) < share, 3, 0)
+    monkeypatch.setattr(hinge_lessons, "_bodies", lambda *_: _drawn(quarters))
+    learn_hinge_sides(box_module, torch.zeros(200, POINTS, 3))
+    sides = box_module.hinge_sides
+    assert bool(sides.learnt) == learnt
+    if learnt:
+        assert float(sides.log_prior[3].exp()) == pytest.approx(share, abs=0.08)
+        assert sides.log_prior.argmax() == 0
+    else:
+        assert sides.surface is None
+
+
+def test_lessons_turn_what_the_network_disagrees_with(box_module, monkeypatch):
+    quarters = (torch.arange(100) % 10 == 0) * 1
+    monkeypatch.setattr(hinge_lessons, "_bodies", lambda *_: _drawn(quarters))
+    given = []
+    monkeypatch.setattr(hinge_lessons, "teach", lambda lessons, _: given.append(lessons) or _TopIsUp())
+    learn_hinge_sides(box_module, torch.zeros(100, POINTS, 3))
+    first, *later = (lessons.frames[:, 0] for lessons in given)
+    assert len(later) == 2 and (first == first[0]).all()  # as all are predicted
+    for frames in later:
+        away = roma.rotmat_geodesic_distance(frames, first) > 1
+        assert 0.04 < away.double().mean() < 0.2
+        torch.testing.assert_close(given[0].frames.sum(dim=1), given[1].frames.sum(dim=1))
+
+
+def test_it_is_part_of_the_weights_and_older_ones_have_none():
+    module = tiny_module(num_parts=2)
+    module.hinge_sides.surface = SurfaceDecision().requires_grad_(False)
+    module.hinge_sides.learnt.fill_(True)
+    module.hinge_sides.closed.fill_(0.7)
+    other = tiny_module(num_parts=2)
+    other.load_state_dict(module.state_dict())
+    assert other.hinge_sides.learnt and other.hinge_sides.surface is not None
+    torch.testing.assert_close(other.state_range, other.states.limits - 0.7)
+    older = {name: value for name, value in module.state_dict().items() if "hinge_sides" not in name}
+    other.load_state_dict(older)
+    assert other.hinge_sides.surface is None
+
+
+def test_predictions_count_from_the_closed_door_with_and_without_a_dense_cloud():
+    module = tiny_module(num_parts=2).eval()
+    clouds = torch.rand(2, POINTS, 3, generator=torch.Generator().manual_seed(2)) - 0.5
+    dense = torch.rand(2, 2000, 3, generator=torch.Generator().manual_seed(4)) - 0.5
+    before = module.predict_points(clouds, dense=dense)
+    sides = module.hinge_sides
+    sides.learnt.fill_(True)
+    sides.closed.fill_(0.4)
+    sides.door.copy_(torch.tensor([0.0, 0.0, -9.0]))  # all is behind it
+    sides.surface = _TopIsUp()
+    alone, after = module.predict_points(clouds), module.predict_points(clouds, dense=dense)
+    for prediction in (alone, after):
+        torch.testing.assert_close(prediction.joint_state, before.joint_state - 0.4, atol=1e-5, rtol=0)
+        torch.testing.assert_close(_posed(prediction), _posed(before), atol=1e-4, rtol=0)
+        _holds(prediction)
+    torch.testing.assert_close(alone.base_pose, before.base_pose)
