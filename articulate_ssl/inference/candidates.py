@@ -11,7 +11,7 @@ import roma
 import torch
 from torch import Tensor
 
-from articulate_ssl.network.hypotheses import Hypotheses
+from articulate_ssl.network.hypotheses import Hypotheses, either
 from articulate_ssl.ops.chamfer import hypothesis_distances, nearest_distance
 from articulate_ssl.shape.observation import Observation
 
@@ -118,3 +118,40 @@ class Candidates:
     error: Tensor
     base: Tensor
     select: Callable[[Tensor], Hypotheses]
+
+
+def better(
+    first: Hypotheses,  # H = 1
+    error: Tensor,  # [B]
+    others: Candidates,
+    turn: Tensor,  # [B, 3, 3]
+) -> Hypotheses:  # H = 1
+    """Of a hypothesis of every cloud, and those of others that are turned about so, the one with the least error."""
+    away = angle_to(others.base[..., :3, :3], turn) > ANOTHER_WAY
+    least, index = others.error.masked_fill(away, torch.inf).min(dim=1)
+    return either(error <= least, first, others.select(index))
+
+
+def likelier(
+    odds: Tensor,  # [B] logarithm of those of the first
+    one: Hypotheses,  # H = 1
+    other: Hypotheses,  # H = 1
+    temperature: Tensor | float,  # [] of the odds
+) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
+    """The likelier, the other, and how much likelier than not it is."""
+    return either(odds < 0, other, one), either(odds < 0, one, other), (odds.abs() / (2 * temperature)).tanh()
+
+
+def frames_of(
+    one: Hypotheses,  # H = 1
+    other: Hypotheses,  # H = 1
+) -> Tensor:  # [B, 2, 3, 3]
+    """Canonical object space -> camera space, of both."""
+    return torch.cat([one.base, other.base], dim=1)[..., :3, :3]
+
+
+def angle_to(
+    rotation: Tensor,  # [B, C, 3, 3]
+    turn: Tensor,  # [B, 3, 3]
+) -> Tensor:  # [B, C]
+    return roma.rotmat_geodesic_distance(rotation, turn[:, None].expand_as(rotation))

@@ -25,9 +25,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-import numpy as np
 import roma
 import torch
 from torch import Tensor
@@ -37,12 +36,23 @@ from articulate_ssl.discovery.search import search_articulated
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
-from articulate_ssl.inference.candidates import ANOTHER_WAY, Candidates, Iteration, rivals
+from articulate_ssl.inference.candidates import (
+    ANOTHER_WAY,
+    Candidates,
+    Iteration,
+    angle_to,
+    better,
+    frames_of,
+    likelier,
+    rivals,
+)
 from articulate_ssl.inference.handedness import Handedness, in_the_mirror
 from articulate_ssl.inference.hinge_sides import HingeSides
+from articulate_ssl.inference.options import InferenceOptions
+from articulate_ssl.inference.packaging import as_prediction
 from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.inference.proportions import fit_proportions
-from articulate_ssl.inference.relief import NUM_FEATURES, describe_relief
+from articulate_ssl.inference.relief import NUM_FEATURES, relief_of
 from articulate_ssl.inference.sliding_search import SlidingSearch
 from articulate_ssl.inference.state_range import StateRange
 from articulate_ssl.inference.surface_decision import SurfaceDecision
@@ -51,54 +61,10 @@ from articulate_ssl.inference.view_search import ViewSearch
 from articulate_ssl.losses.reconstruction import distances_to_parts
 from articulate_ssl.network.articulated_network import ArticulatedNetwork
 from articulate_ssl.network.heads.shape import CanonicalShape
-from articulate_ssl.network.hypotheses import Hypotheses, either
+from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.network.rigid_alignment import RigidAlignment
 from articulate_ssl.ops.chamfer import chamfer, hypothesis_distances
-from articulate_ssl.ops.kd_tree import kd_tree
 from articulate_ssl.shape.observation import FAR, Observation
-from articulate_ssl.shape.stretch import principal_directions
-
-# Weight of what similar views, or clouds, say about the part of a point, beside the posed shape: of 80 development
-# views each the mIoU is 90, 91 and 47 (safes, washing machines, chests) by three quarters, 90, 89 and 44 by a half, 90,
-# 81 and 35 by nothing (docs/experiments.md, step 99).
-_VIEWS_SAY = 0.75
-
-
-@dataclass(frozen=True)
-class InferenceOptions:
-    """What happens at test time after the network.
-
-    Attributes:
-        refine: Register the predicted shape to the cloud from the best hypotheses; null leaves it to the recipe (true
-            staged, false paper).
-        points: Most points of a cloud that registration reads and labels (a farthest-point prefix). Which way up a
-            closed laptop is shows in less than the spacing of the few points that suffice for the networks.
-        candidates: Hypotheses that are refined; the best reconstruction wins.
-        rounds: Rounds of registration.
-        proportions: Cycles of six steps of descent in which a cloud's explanation takes its own proportions in the end
-            (`proportions.py`); 0 leaves it to the network. Not where parts slide, whose places similar clouds say.
-        most_turned: Degrees by which registration may turn a part from where the network put it; of a hypothesis that
-            it turns further, the network's word stays. 180 lets it go anywhere. Where distances count one way, nothing
-            in a cloud says that a hidden part is in the wrong place, but the network has seen where they are.
-        coarse_scale: First standard deviation of the correspondences, in normalised units.
-        fine_scale: Last one.
-        part_neighbours: So many points of a posed part say by their mean distance how near it is to a point, which
-            belongs to the nearest part; null leaves it to the recipe (1 staged, 6 paper, whose shapes have some points
-            on other parts).
-        columns: Report at test time, from the same clouds, what the category's shape without a network reaches, the
-            network alone, and the network with registration (`training/columns.py`).
-    """
-
-    refine: bool | None = None
-    points: int = 512
-    candidates: int = 4
-    rounds: int = 8
-    proportions: int = 25
-    most_turned: float = 180.0
-    coarse_scale: float = 0.05
-    fine_scale: float = 0.02
-    part_neighbours: int | None = None
-    columns: bool = False
 
 
 class PoseEstimator:
@@ -274,8 +240,8 @@ class PoseEstimator:
             error = self._distance(chosen, points)
             if registers and fits:
                 chosen = self._in_proportion(chosen, points)
-            rival = self._prediction(other, points, torch.zeros_like(margin))
-            return self._prediction(chosen, points, margin, votes), rival, error
+            rival = self._packaged(other, points, torch.zeros_like(margin))
+            return self._packaged(chosen, points, margin, votes), rival, error
 
     def _decided(
         self,
@@ -293,8 +259,8 @@ class PoseEstimator:
         twin, temperature = self._twin(one, points, registers), 1.0
         odds = self.two_ways.relief_odds(self._relief(one, dense), self._relief(twin, dense))
         if surface is not None:
-            odds, temperature = odds + surface.log_odds(_frames(one, twin), dense), surface.temperature
-        return _likelier(odds, one, twin, temperature)
+            odds, temperature = odds + surface.log_odds(frames_of(one, twin), dense), surface.temperature
+        return likelier(odds, one, twin, temperature)
 
     def _preferred(
         self,
@@ -309,9 +275,9 @@ class PoseEstimator:
 
         A rival that is preferred fitted worse, mostly as its joints got stuck: it is registered again from others.
         """
-        frames = _frames(one, rival)
+        frames = frames_of(one, rival)
         surface = self.two_ways.surface
-        chosen, other, decided = _likelier(surface.log_odds(frames, dense), one, rival, surface.temperature)
+        chosen, other, decided = likelier(surface.log_odds(frames, dense), one, rival, surface.temperature)
         alone = (frames[:, 0] == frames[:, 1]).flatten(1).all(dim=1)
         stuck = (chosen.base != one.base).flatten(1).any(dim=1).nonzero()[:, 0]
         if registers and len(stuck):
@@ -331,7 +297,7 @@ class PoseEstimator:
         copies = one.select(torch.zeros(len(points), 1 + len(starts), dtype=torch.long, device=points.device))
         state = torch.cat([one.state, starts.expand(len(points), -1, -1)], dim=1)
         found, error = self._registered(copies.at(copies.base, state), points)
-        away = _angle(found.base[..., :3, :3], one.base[:, 0, :3, :3]) > ANOTHER_WAY
+        away = angle_to(found.base[..., :3, :3], one.base[:, 0, :3, :3]) > ANOTHER_WAY
         return found.select(error.masked_fill(away, torch.inf).argmin(dim=1))
 
     def _best(self, candidates: Candidates) -> tuple[Hypotheses, Hypotheses, Tensor]:
@@ -355,7 +321,7 @@ class PoseEstimator:
         """
         chosen, _, _ = self._best(self._candidates(points, num_points, registers=True))
         twin = self._twin(chosen, points, registers=True)
-        return _frames(chosen, twin), [(self._relief(chosen, some), self._relief(twin, some)) for some in dense]
+        return frames_of(chosen, twin), [(self._relief(chosen, some), self._relief(twin, some)) for some in dense]
 
     def _candidates(
         self,
@@ -411,7 +377,7 @@ class PoseEstimator:
             return first, rival, margin, votes
         error = chamfer_l1(points, first.posed()[:, 0].flatten(1, 2), self.observation.bidirectional)
         others = self._candidates(points, num_points, registers=True)
-        return _better(first, error, others, first.base[:, 0, :3, :3]), rival, margin, votes
+        return better(first, error, others, first.base[:, 0, :3, :3]), rival, margin, votes
 
     def _seen(
         self,
@@ -432,7 +398,7 @@ class PoseEstimator:
         if num_points is None:
             return first, rival, margin, votes
         turn = base[:, 0, :3, :3]
-        chosen = _better(first, error[:, 0], self._candidates(points, num_points, True, turn), turn)
+        chosen = better(first, error[:, 0], self._candidates(points, num_points, True, turn), turn)
         return chosen, rival, margin, votes
 
     def _twin(
@@ -457,18 +423,7 @@ class PoseEstimator:
         dense: Tensor,  # [B, P, 3]
     ) -> Tensor:  # [B, K * NUM_FEATURES]
         """The relief of clouds under an explanation of each (`describe_relief`)."""
-        parts = self.articulated.category.canonical().shape
-        axes = torch.stack([principal_directions(part) for part in parts]).double().cpu().numpy()
-        pose, posed = one.object_pose()[:, 0], one.posed()[:, 0]
-        axis, pivot = _joint_lines(one, pose)
-        if one.structure.joint_type != REVOLUTE:
-            axis, pivot = axis[:, :0], pivot[:, :0]
-        arrays = (value.double().cpu().numpy() for value in (dense, posed, pose, pivot, axis))
-        described = []
-        for cloud, shape, *lines in zip(*arrays, strict=True):
-            nearest = kd_tree(shape.reshape(-1, 3)).query(cloud)[1]
-            described.append(describe_relief(cloud, nearest // shape.shape[1], lines[0], axes, *lines[1:]))
-        return torch.from_numpy(np.stack(described)).to(dense)
+        return relief_of(one, self.articulated.category.canonical().shape, dense)
 
     @torch.no_grad()
     def search(
@@ -495,10 +450,10 @@ class PoseEstimator:
             if self.view_search.learnt:
                 found, _, margin, votes = self._seen(points)
                 shown = self._in_proportion(found, points)
-                return self._prediction(shown, points, margin, votes), self._distance(found, points)
+                return self._packaged(shown, points, margin, votes), self._distance(found, points)
             if dense is not None and self.sliding.learnt:
                 found, _, margin, votes = self._slid(points, dense)
-                return self._prediction(found, points, margin, votes), self._distance(found, points)
+                return self._packaged(found, points, margin, votes), self._distance(found, points)
             rotations = rotation_group(60).elements.to(points)
             rotations = rotations[self.observation.orientation.contains(rotations)]
             shape = self.articulated.category.articulated_shape(self.articulated.joint_type)
@@ -508,7 +463,7 @@ class PoseEstimator:
             if dense is not None and self.two_ways.learnt:
                 found, _, margin = self._decided(found, points, dense, registers=True)
             shown = self._in_proportion(found, points)
-            return self._prediction(shown, points, margin), self._distance(found, points)
+            return self._packaged(shown, points, margin), self._distance(found, points)
 
     def _in_proportion(
         self,
@@ -534,7 +489,7 @@ class PoseEstimator:
         """The leading hypotheses after articulated registration of the predicted shape, and their errors."""
         ranked, rotation = last.ranked, last.hypotheses.base[..., :3, :3]
         if turn is not None:
-            ranked = ranked + FAR * (_angle(rotation, turn) > ANOTHER_WAY)
+            ranked = ranked + FAR * (angle_to(rotation, turn) > ANOTHER_WAY)
         leading = ranked.topk(min(self.inference.candidates, ranked.shape[1]), largest=False).indices
         return self._registered(last.hypotheses.select(leading), points)
 
@@ -569,89 +524,14 @@ class PoseEstimator:
         state = torch.where(kept[..., None], registered.state, candidates.state)
         return candidates.at(base, state), torch.where(kept, error, own.view_as(error))
 
-    def _prediction(
+    def _packaged(
         self,
         chosen: Hypotheses,  # H = 1
         points: Tensor,  # [B, N, 3]
         margin: Tensor,  # [B]
-        votes: Tensor | None = None,  # [B, N, K] which parts points are of, beside the nearest of the posed ones
+        votes: Tensor | None = None,  # [B, N, K]
     ) -> Prediction:
-        """Package one hypothesis per cloud."""
-        pose = chosen.object_pose()[:, 0]
-        part_pose = pose.clone()
-        part_pose[..., :3, 3] = transform_points(pose, chosen.assembly[:, :, None])[:, :, 0]
-        chain = chosen.chain
-        parent = torch.tensor(chain.parent, device=points.device)
-        posed = chosen.posed()[:, 0]
-        to_part = distances_to_parts(points, posed, self.inference.part_neighbours or 1)
-        shape = (len(points), len(parent))
-        axis, pivot = _joint_lines(chosen, pose)
-        part_id, probability = to_part.argmin(dim=-1), (to_part.square() / (-2 * self.posterior_scale**2)).softmax(-1)
-        if votes is not None:
-            probability = torch.lerp(probability, votes, _VIEWS_SAY)
-            part_id = probability.argmax(dim=-1)
-        return Prediction(
-            part_id=part_id,
-            part_probability=probability,
-            part_pose=part_pose,
-            part_shape=chosen.part_shape,
-            assembly=chosen.assembly,
-            base_pose=chosen.base[:, 0],
-            joint_parent=parent.expand(shape),
-            joint_child=torch.tensor(chain.child, device=points.device).expand(shape),
-            joint_type=torch.full(shape, chosen.structure.joint_type, device=points.device),
-            joint_axis=axis,
-            joint_pivot=pivot,
-            joint_state=chosen.state[:, 0],
-            canonical_axis=chosen.axis[:, 0],
-            canonical_pivot=chosen.pivot,
-            reconstruction_error=self._distance(chosen, points),
-            margin=margin,
-        )
-
-
-def _better(
-    first: Hypotheses,  # H = 1
-    error: Tensor,  # [B]
-    others: Candidates,
-    turn: Tensor,  # [B, 3, 3]
-) -> Hypotheses:  # H = 1
-    """Of a hypothesis of every cloud, and those of others that are turned about so, the one with the least error."""
-    away = _angle(others.base[..., :3, :3], turn) > ANOTHER_WAY
-    least, index = others.error.masked_fill(away, torch.inf).min(dim=1)
-    return either(error <= least, first, others.select(index))
-
-
-def _likelier(
-    odds: Tensor,  # [B] logarithm of those of the first
-    one: Hypotheses,  # H = 1
-    other: Hypotheses,  # H = 1
-    temperature: Tensor | float,  # [] of the odds
-) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
-    """The likelier, the other, and how much likelier than not it is."""
-    return either(odds < 0, other, one), either(odds < 0, one, other), (odds.abs() / (2 * temperature)).tanh()
-
-
-def _frames(
-    one: Hypotheses,  # H = 1
-    other: Hypotheses,  # H = 1
-) -> Tensor:  # [B, 2, 3, 3]
-    """Canonical object space -> camera space, of both."""
-    return torch.cat([one.base, other.base], dim=1)[..., :3, :3]
-
-
-def _angle(
-    rotation: Tensor,  # [B, C, 3, 3]
-    turn: Tensor,  # [B, 3, 3]
-) -> Tensor:  # [B, C]
-    return roma.rotmat_geodesic_distance(rotation, turn[:, None].expand_as(rotation))
-
-
-def _joint_lines(
-    one: Hypotheses,  # H = 1
-    pose: Tensor,  # [B, K, 4, 4] canonical object space -> camera space of every part
-) -> tuple[Tensor, Tensor]:  # [B, J, 3], [B, J, 3]
-    """Axes and pivots in camera space."""
-    parent_pose = pose[:, list(one.chain.parent)]
-    axis = (parent_pose[..., :3, :3] @ one.axis[:, 0, ..., None]).squeeze(-1)
-    return axis, transform_points(parent_pose, one.pivot[:, :, None])[:, :, 0]
+        """See `as_prediction`."""
+        neighbours = self.inference.part_neighbours or 1
+        distance = self._distance(chosen, points)
+        return as_prediction(chosen, points, distance, margin, self.posterior_scale, neighbours, votes)

@@ -7,10 +7,18 @@ What lies next to a joint is left out: to which part it belongs is known least.
 
 from __future__ import annotations
 
-import numpy as np
-from scipy.optimize import linear_sum_assignment
+from collections.abc import Sequence
 
+import numpy as np
+import torch
+from scipy.optimize import linear_sum_assignment
+from torch import Tensor
+
+from articulate_ssl.geometry.screw import REVOLUTE
+from articulate_ssl.inference.packaging import joint_lines
+from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.ops.kd_tree import kd_tree
+from articulate_ssl.shape.stretch import principal_directions
 
 # Normalised units from a revolute joint's line. On laptops labels near the hinge are a matter of taste; of 400 clouds
 # .12 left 94 % decided rightly, .06 and .2 76 %, 0 less (docs/experiments.md, step 57).
@@ -92,3 +100,22 @@ def _in_own_axes(points: np.ndarray) -> np.ndarray:
     given, nearest = linear_sum_assignment(-np.abs(own))
     own = own[:, nearest]
     return points @ (own * np.sign(own[given, given]))
+
+
+def relief_of(
+    one: Hypotheses,  # H = 1
+    parts: Sequence[Tensor],  # [M, 3] of each part of the category's shape
+    dense: Tensor,  # [B, P, 3]
+) -> Tensor:  # [B, K * NUM_FEATURES]
+    """The relief of clouds under an explanation of each (`describe_relief`)."""
+    axes = torch.stack([principal_directions(part) for part in parts]).double().cpu().numpy()
+    pose, posed = one.object_pose()[:, 0], one.posed()[:, 0]
+    axis, pivot = joint_lines(one, pose)
+    if one.structure.joint_type != REVOLUTE:
+        axis, pivot = axis[:, :0], pivot[:, :0]
+    arrays = (value.double().cpu().numpy() for value in (dense, posed, pose, pivot, axis))
+    described = []
+    for cloud, shape, *lines in zip(*arrays, strict=True):
+        nearest = kd_tree(shape.reshape(-1, 3)).query(cloud)[1]
+        described.append(describe_relief(cloud, nearest // shape.shape[1], lines[0], axes, *lines[1:]))
+    return torch.from_numpy(np.stack(described)).to(dense)

@@ -8,7 +8,7 @@ from typing import Any
 
 from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.inference.checkpoint_file import CheckpointError, read_checkpoint
-from articulate_ssl.inference.pose_estimation import InferenceOptions
+from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.losses.objective import ObjectiveOptions
 from articulate_ssl.network.options import NetworkOptions
 from articulate_ssl.training.module import ArticulatedPoseModule

@@ -21,7 +21,8 @@ from articulate_ssl.geometry.orientation_range import OrientationRange
 from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE
 from articulate_ssl.inference.checkpoint_file import CHECKPOINT_KEY
 from articulate_ssl.inference.confidence import Confidence, relative_error
-from articulate_ssl.inference.pose_estimation import InferenceOptions, PoseEstimator
+from articulate_ssl.inference.options import InferenceOptions
+from articulate_ssl.inference.pose_estimation import PoseEstimator
 from articulate_ssl.inference.prediction import Prediction, ScanEstimate
 from articulate_ssl.inference.scan_scales import predict_scans
 from articulate_ssl.losses.objective import ObjectiveOptions, rigid_loss

@@ -7,7 +7,7 @@ import roma
 import torch
 from tiny import POINTS, tiny_module
 
-from articulate_ssl.inference.pose_estimation import InferenceOptions
+from articulate_ssl.inference.options import InferenceOptions
 
 OPTIONS = InferenceOptions(refine=True, candidates=12)
 

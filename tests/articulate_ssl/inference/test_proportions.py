@@ -10,7 +10,7 @@ from tiny import POINTS, tiny_module
 
 from articulate_ssl.discovery.registration import chamfer_l1, register_articulated
 from articulate_ssl.geometry.se3 import se3, transform_points
-from articulate_ssl.inference.pose_estimation import InferenceOptions
+from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.inference.proportions import fit_proportions
 from articulate_ssl.network.heads.shape import CanonicalShape
 from articulate_ssl.network.heads.structure import Structure

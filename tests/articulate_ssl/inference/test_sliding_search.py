@@ -11,7 +11,8 @@ from articulate_ssl.discovery.synchronization import unit_boxes
 from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.geometry.screw import PRISMATIC
 from articulate_ssl.geometry.se3 import se3, transform_points
-from articulate_ssl.inference.pose_estimation import InferenceOptions, PoseEstimator
+from articulate_ssl.inference.options import InferenceOptions
+from articulate_ssl.inference.pose_estimation import PoseEstimator
 from articulate_ssl.inference.scan_scales import predict_scans
 from articulate_ssl.inference.sliding_search import SlidingSearch
 from articulate_ssl.network.articulated_network import ArticulatedNetwork

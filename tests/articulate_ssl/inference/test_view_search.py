@@ -9,7 +9,8 @@ from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.geometry.orientation_range import OrientationRange
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import se3, transform_points
-from articulate_ssl.inference.pose_estimation import InferenceOptions, PoseEstimator
+from articulate_ssl.inference.options import InferenceOptions
+from articulate_ssl.inference.pose_estimation import PoseEstimator
 from articulate_ssl.inference.view_search import ViewSearch
 from articulate_ssl.network.articulated_network import ArticulatedNetwork
 from articulate_ssl.network.options import NetworkOptions

@@ -11,7 +11,7 @@ from synthetic import write_synthetic_set
 from tiny import quiet_trainer, tiny_data, tiny_module, warmed_up
 from unlabelled import without_labels
 
-from articulate_ssl.inference.pose_estimation import InferenceOptions
+from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.training.columns import NETWORK, NO_NETWORK, REGISTERED
 
 

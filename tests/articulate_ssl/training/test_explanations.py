@@ -6,7 +6,7 @@ import torch
 from tiny import POINTS, tiny_module
 
 from articulate_ssl.inference.candidates import ANOTHER_WAY
-from articulate_ssl.inference.pose_estimation import InferenceOptions
+from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.inference.relief import NUM_FEATURES
 from articulate_ssl.training import explanations
 from articulate_ssl.training.explanations import _object_poses, learn_two_ways
@@ -110,7 +110,7 @@ def test_a_preferred_rival_is_registered_again_from_other_states(module, clouds,
         module.two_ways.surface = Preference(sign)
         found, _ = module.estimator.predict_with_rivals(points, POINTS, True, clouds)
         preferred = sign * other > 0
-        before, kept = (module.estimator._prediction(some, points, margin) for some in (stuck, one))
+        before, kept = (module.estimator._packaged(some, points, margin) for some in (stuck, one))
         assert preferred.any()
         assert (found.reconstruction_error < before.reconstruction_error)[preferred].all()
         angle = roma.rotmat_geodesic_distance(found.base_pose[:, :3, :3], before.base_pose[:, :3, :3])

@@ -10,7 +10,7 @@ from synthetic import write_synthetic_set
 from tiny import POINTS, fit, quiet_trainer, tiny_data, tiny_module
 
 from articulate_ssl.inference.checkpoint_file import CheckpointError
-from articulate_ssl.inference.pose_estimation import InferenceOptions
+from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.losses.objective import ObjectiveOptions, paper_terms
 from articulate_ssl.training.checkpoint import load_module

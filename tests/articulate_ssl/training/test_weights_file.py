@@ -12,7 +12,7 @@ from synthetic import write_synthetic_set
 from tiny import POINTS, fit, tiny_module
 
 from articulate_ssl.inference.checkpoint_file import CheckpointError
-from articulate_ssl.inference.pose_estimation import InferenceOptions
+from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.training import shipped_weights
 from articulate_ssl.training.checkpoint import load_module
 from articulate_ssl.training.module import ArticulatedPoseModule

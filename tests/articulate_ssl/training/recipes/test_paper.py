@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from articulate_ssl.geometry.se3 import transform_points
-from articulate_ssl.inference.pose_estimation import InferenceOptions
+from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.losses.objective import ObjectiveOptions, paper_terms
 from articulate_ssl.network.options import NetworkOptions
 from articulate_ssl.training.recipes.paper import TrainingRecipe
