@@ -29,6 +29,10 @@ _BOUND = 0.35
 _START = 0.95  # of the bound: a start beyond is one here, where the gradient still lives
 _RIDGE = 1e-3  # weight of the squared log-stretch: decides what the clouds leave open
 _HELD = 0.1  # weight of the squared distance that a cloud's own joint lines go from where they started. Chosen.
+# Weight of how far parts are from the line of a joint between them, beyond the slack: the mean of that many nearest
+# points of each part. Hinges of depth views were .15 off without, .054 with it (docs/experiments.md, step 125); ten
+# times the weight is no better.
+_TOUCH, _SLACK, _NEAREST = 0.3, 0.02, 8
 _RATE = 0.01  # of Adam, at the start
 _LAST_RATE = 0.02  # what is left of it in the last cycle
 _POINTS = 384  # of template and cloud, drawn anew for every step
@@ -127,12 +131,14 @@ class InstanceFit:
         shared: bool = True,
         keep: float = 1.0,
         bidirectional: bool = True,
+        touching: bool = False,
     ) -> None:
         """Descend for `cycles` times `steps` steps; with `shared`, also joint lines, and labels after every cycle.
 
         Args:
             keep: Share of the clouds, best fitted first, that count.
             bidirectional: The clouds show all sides, so that each of the template's points must be near them, too.
+            touching: Both parts of a joint are drawn to its line, as by the paper's joint regularization.
         """
         own = [self._state, self._turn, self._shift, self._stretch]
         # In a frame that clouds have in common, what slides slides along one of its axes, exactly.
@@ -147,7 +153,7 @@ class InstanceFit:
             for _ in range(steps):
                 optimizer.zero_grad()
                 with torch.enable_grad():
-                    self._loss(clouds, keep, bidirectional).backward()
+                    self._loss(clouds, keep, bidirectional, touching).backward()
                 optimizer.step()
                 self._state.data = self._shape.joints.clamped(self._state.data)
             if shared:
@@ -203,7 +209,7 @@ class InstanceFit:
         axis = functional.normalize(self._axis, dim=-1)
         return replace(self._shape.joints, axis=axis, pivot=self._pivot)
 
-    def _loss(self, clouds: Tensor, keep: float, bidirectional: bool) -> Tensor:
+    def _loss(self, clouds: Tensor, keep: float, bidirectional: bool, touching: bool) -> Tensor:
         rows = self._draw(len(self._shape.label), clouds.device)
         posed, seen = self.posed(rows), clouds[:, self._draw(clouds.shape[1], clouds.device)]
         error = _softened(_distance(seen, posed)).mean(dim=1)
@@ -213,7 +219,22 @@ class InstanceFit:
         ridge = _RIDGE * (self._stretch.square().sum() + self._beside.square().sum())
         if self._start is not None:
             ridge = ridge + _HELD * (self._pivot - self._start).square().sum()
+        if touching:
+            ridge = ridge + _TOUCH * self._apart().sum()
         return error[counts].sum() + ridge
+
+    def _apart(self) -> Tensor:
+        """How far parts are from the lines of their joints, in all clouds [n]; where they turn that stays the same."""
+        rest, joints = self._stretched()
+        whole, result = rest.move(self._shape.points, self._shape.label), 0.0
+        for joint, ends in enumerate(zip(joints.chain.parent, joints.chain.child, strict=True)):
+            axis, pivot = joints.axis[..., joint, None, :], joints.pivot[..., joint, None, :]
+            for part in ends:
+                offset = whole[:, self._shape.label == part] - pivot
+                away = (torch.linalg.cross(offset, axis.expand_as(offset)).square().sum(dim=-1) + 1e-12).sqrt()
+                nearest = away.topk(min(_NEAREST, away.shape[1]), largest=False).values.mean(dim=1)
+                result = result + (nearest - _SLACK).relu()
+        return result
 
     def _draw(self, total: int, device: torch.device) -> Tensor:
         return torch.randperm(total, generator=self._generator)[:_POINTS].to(device)

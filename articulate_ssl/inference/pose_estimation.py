@@ -475,7 +475,10 @@ class PoseEstimator:
         if not self.inference.proportions or joint_type != REVOLUTE:
             return one
         category = self.articulated.category.articulated_shape(joint_type)
-        return fit_proportions(one, category, points, self.inference.proportions, self.observation.bidirectional)
+        # Complete clouds, and scans that teach views, show where a hinge is.
+        both = self.observation.bidirectional
+        touching = both and self.observation.orientation.limited
+        return fit_proportions(one, category, points, self.inference.proportions, both, touching)
 
     def _distance(
         self,

@@ -4,7 +4,8 @@ Objects of a category differ in proportions, and the network's stretches say so 
 shorter than its shape, registration turns it to make up for that. So in the end pose, joint states, the stretch of
 every part and where its hinge is descend together, each cloud's on its own (`discovery.instance_fit`), to a smaller
 distance between cloud and shape. Parts stay hinged, axes stay as the network says. Where distances count one way, what
-a view hides pulls at nothing.
+a view hides pulls at nothing. Where parts were found in views alone, which leave open where their hinge is, parts are
+drawn to it.
 """
 
 from __future__ import annotations
@@ -27,11 +28,15 @@ def fit_proportions(
     points: Tensor,  # [B, N, 3]
     cycles: int,
     bidirectional: bool = True,
+    touching: bool = False,
 ) -> Hypotheses:  # H = 1
     """The category's shape in the proportions of clouds, from where explanations of them are.
 
     Its points are the category's, as the network's own stretches and displacements of them say no more about which
     part is where (docs/experiments.md, step 118); joint lines are those of the explanations.
+
+    Args:
+        touching: Both parts of a joint are drawn to its line (`InstanceFit.optimise`).
     """
     # A test runs in inference mode, whose tensors no gradient goes through.
     with torch.inference_mode(False):
@@ -41,7 +46,7 @@ def fit_proportions(
         base = one.base[:, 0].clone()
         seen, still = transform_points(invert_se3(base), points.clone()), torch.eye(4).to(base).expand_as(base)
         fit = InstanceFit(shape, still, one.state[:, 0].clone(), torch.Generator().manual_seed(0))
-        fit.optimise(seen, cycles, shared=False, bidirectional=bidirectional)
+        fit.optimise(seen, cycles, shared=False, bidirectional=bidirectional, touching=touching)
         instances = fit.instances()
         parts = torch.stack([instances.part(part) for part in range(shape.num_parts)], dim=1)
         center = parts.mean(dim=2)

@@ -9,7 +9,9 @@ from articulated_objects import GLASSES, LAPTOP, OVEN, Clouds, clouds, true_shap
 from tiny import POINTS, tiny_module
 
 from articulate_ssl.discovery.registration import chamfer_l1, register_articulated
+from articulate_ssl.geometry.orientation_range import OrientationRange
 from articulate_ssl.geometry.se3 import se3, transform_points
+from articulate_ssl.inference import pose_estimation
 from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.inference.proportions import fit_proportions
 from articulate_ssl.network.heads.shape import CanonicalShape
@@ -137,3 +139,28 @@ def test_hands_are_told_by_the_errors_before_proportions(monkeypatch):
     before, mirrored = estimator.mirror_errors(points, POINTS)
     torch.testing.assert_close(odds[0], hands.log_odds(before, mirrored))
     assert (shown.reconstruction_error - before).abs().min() > 1e-4  # what is shown has proportions
+
+
+def test_parts_are_drawn_to_a_hinge_that_floats(monkeypatch):
+    """As discovery from views leaves it: off both plates; the way registration may move it costs nothing there."""
+    data = clouds(LAPTOP, count=4, points=600, resample=True)
+    shape = _category(LAPTOP, data)
+    pivot = shape.joints.pivot + torch.tensor([0.0, 0.08, 0.05])
+    shape = replace(shape, joints=replace(shape.joints, pivot=pivot))
+    before = _registered(shape, data)
+
+    def apart(one: Hypotheses) -> torch.Tensor:
+        offset = one.object_shape() - one.pivot[:, :1, None]
+        along = torch.linalg.cross(offset, one.axis[:, 0, 0, None, None].expand_as(offset)).norm(dim=-1)
+        return along.sort(dim=-1).values[..., :8].mean(dim=-1).amax(dim=-1)
+
+    left, drawn = (fit_proportions(before, shape, data.points, CYCLES, touching=way) for way in (False, True))
+    assert apart(drawn).max() < 0.03 < apart(left).min()
+    # Parts of complete clouds are not.
+    seen = []
+    monkeypatch.setattr(pose_estimation, "fit_proportions", lambda *args: seen.append(args[-2:]) or args[0])
+    for views, unidirectional in ((60.0, False), (180.0, False), (60.0, True)):
+        module = tiny_module(orientation_range=views).eval()
+        module.estimator.observation = Observation(OrientationRange(views), unidirectional)
+        module.predict_points(torch.rand(1, POINTS, 3))
+    assert seen == [(True, True), (True, False), (False, False)]
