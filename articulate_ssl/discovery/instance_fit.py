@@ -29,10 +29,10 @@ _BOUND = 0.35
 _START = 0.95  # of the bound: a start beyond is one here, where the gradient still lives
 _RIDGE = 1e-3  # weight of the squared log-stretch: decides what the clouds leave open
 _HELD = 0.1  # weight of the squared distance that a cloud's own joint lines go from where they started. Chosen.
-# Weight of how far parts are from the line of a joint between them, beyond the slack: the mean of that many nearest
-# points of each part. Hinges of depth views were .15 off without, .054 with it (docs/experiments.md, step 125); ten
-# times the weight is no better.
-_TOUCH, _SLACK, _NEAREST = 0.3, 0.02, 8
+# Weight of how far parts are from the line of a joint between them, by the mean of that many nearest points of each.
+# They may be as far as in the template, but for what is less or more than is likely (docs/experiments.md, step 125).
+_TOUCH, _NEAREST = 0.3, 8
+_SLACK = (0.02, 0.05)
 _RATE = 0.01  # of Adam, at the start
 _LAST_RATE = 0.02  # what is left of it in the last cycle
 _POINTS = 384  # of template and cloud, drawn anew for every step
@@ -80,6 +80,7 @@ class InstanceFit:
         self.axes = axes
         self._axes = torch.eye(3).to(base).repeat(shape.num_parts, 1, 1) if axes is None else axes
         self._center = shape.points.mean(dim=0)
+        self._slack: Tensor | None = None  # [n, 2 J] how far parts may be from the lines of their joints
         self._measure_parts()
 
     @property
@@ -146,6 +147,9 @@ class InstanceFit:
         own = own if self.axes is None else [*own, self._beside]
         own = own if self._start is None else [*own, self._pivot]
         parameters = lines + own if shared else own
+        if touching:
+            self._slack = self._to_lines(self._shape.points.expand(len(self._base), -1, -1), self._joints())
+            self._slack = self._slack.clamp(*_SLACK)
         optimizer = torch.optim.Adam([p.requires_grad_() for p in parameters], lr=_RATE)
         for cycle in range(cycles):
             for group in optimizer.param_groups:
@@ -224,17 +228,21 @@ class InstanceFit:
         return error[counts].sum() + ridge
 
     def _apart(self) -> Tensor:
-        """How far parts are from the lines of their joints, in all clouds [n]; where they turn that stays the same."""
+        """How much farther parts are from the lines of their joints than they may be, in all clouds [n]."""
         rest, joints = self._stretched()
-        whole, result = rest.move(self._shape.points, self._shape.label), 0.0
+        distances = self._to_lines(rest.move(self._shape.points, self._shape.label), joints)
+        return (distances - self._slack).relu().sum(dim=-1)
+
+    def _to_lines(self, points: Tensor, joints: Joints) -> Tensor:
+        """How far both parts of every joint are from its line [n, 2 J]; wherever they turn, that stays the same."""
+        result = []
         for joint, ends in enumerate(zip(joints.chain.parent, joints.chain.child, strict=True)):
             axis, pivot = joints.axis[..., joint, None, :], joints.pivot[..., joint, None, :]
             for part in ends:
-                offset = whole[:, self._shape.label == part] - pivot
+                offset = points[:, self._shape.label == part] - pivot
                 away = (torch.linalg.cross(offset, axis.expand_as(offset)).square().sum(dim=-1) + 1e-12).sqrt()
-                nearest = away.topk(min(_NEAREST, away.shape[1]), largest=False).values.mean(dim=1)
-                result = result + (nearest - _SLACK).relu()
-        return result
+                result.append(away.topk(min(_NEAREST, away.shape[1]), largest=False).values.mean(dim=1))
+        return torch.stack(result, dim=-1)
 
     def _draw(self, total: int, device: torch.device) -> Tensor:
         return torch.randperm(total, generator=self._generator)[:_POINTS].to(device)
