@@ -145,7 +145,7 @@ def test_parts_are_drawn_to_a_hinge_that_floats(monkeypatch):
     """As discovery from views leaves it: off both plates; the way registration may move it costs nothing there."""
     data = clouds(LAPTOP, count=4, points=600, resample=True)
     shape = _category(LAPTOP, data)
-    pivot = shape.joints.pivot + torch.tensor([0.0, 0.08, 0.05])
+    pivot = shape.joints.pivot + torch.tensor([0.0, 0.16, 0.08])
     shape = replace(shape, joints=replace(shape.joints, pivot=pivot))
     before = _registered(shape, data)
 
@@ -155,7 +155,8 @@ def test_parts_are_drawn_to_a_hinge_that_floats(monkeypatch):
         return along.sort(dim=-1).values[..., :8].mean(dim=-1).amax(dim=-1)
 
     left, drawn = (fit_proportions(before, shape, data.points, CYCLES, touching=way) for way in (False, True))
-    assert apart(drawn).max() < 0.03 < apart(left).min()
+    assert apart(left).max() > 0.08
+    assert apart(drawn).max() < 0.055
     # Parts of complete clouds are not.
     seen = []
     monkeypatch.setattr(pose_estimation, "fit_proportions", lambda *args: seen.append(args[-2:]) or args[0])
