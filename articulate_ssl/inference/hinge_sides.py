@@ -98,14 +98,12 @@ class HingeSides(nn.Module):
 
         def volume(state: float) -> float:
             whole = torch.cat([shape.part(root), _at(shape, child, state)])
-            return ConvexHull(whole.double().cpu().numpy()).volume
+            return ConvexHull(whole.double().cpu().numpy(), qhull_options="QJ").volume  # flat ones, too
 
         closed = min(states, key=volume)
         door = _at(shape, child, closed)
-        middle, extent = (
-            (door.amax(dim=0) + door.amin(dim=0)) / 2,
-            (door @ axes).amax(dim=0) - (door @ axes).amin(dim=0),
-        )
+        middle = (door.amax(dim=0) + door.amin(dim=0)) / 2
+        extent = (door @ axes).amax(dim=0) - (door @ axes).amin(dim=0)
         normal = axes[:, 1 + int(extent[1:].argmin())]
         normal = normal * ((shape.part(root).mean(dim=0) - middle) @ normal).sign()
         self.closed.fill_(closed)
