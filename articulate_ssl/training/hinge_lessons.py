@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 _BATCH, _CHUNK = 16, 64
 _ROUNDS = 3  # of lessons
-_KNOWN = 0.9  # share of the clouds in which enough of the body is seen, without which nothing is learnt. Chosen.
+# Share of the first clouds in which enough of the body is seen, without which nothing is learnt. Chosen.
+_FIRST, _KNOWN = 64, 0.9
 # Shares of the clouds that the network was not taught by. Chosen: fewer that are turned are not worth a network; more
 # would mean that most are not right; and one that cannot tell sides apart is undecided of many.
 _LEAST_TURNED, _MOST_TURNED, _MOST_UNDECIDED, _DECIDED = 0.02, 0.4, 0.15, 2.0
@@ -47,11 +48,11 @@ def learn_hinge_sides(
     if network.num_parts != 2 or network.joint_type != REVOLUTE or TAUGHT * len(clouds) < FEWEST:
         return
     sides.measure(network.category.articulated_shape(network.joint_type), module.states.limits)
+    if _bodies(module, clouds[:_FIRST]).known.double().mean() < _KNOWN:
+        log.info("hinge sides: too little is seen behind the closed door")
+        return
     bodies = _bodies(module, clouds)
     known = bodies.known.nonzero()[:, 0]
-    if len(known) < _KNOWN * len(clouds):
-        log.info("hinge sides: too little is behind the closed door, in %d of %d clouds", len(known), len(clouds))
-        return
     bodies = _rows(bodies, known)
     order = torch.randperm(len(known), generator=torch.Generator().manual_seed(0)).to(known.device)
     count = int(TAUGHT * len(order))

@@ -231,7 +231,7 @@ def _drawn(quarters: torch.Tensor) -> Bodies:
 @pytest.mark.parametrize(("share", "learnt"), [(0.12, True), (0.0, False), (0.6, False)], ids=["some", "none", "most"])
 def test_some_that_lie_are_learnt(box_module, monkeypatch, share, learnt):
     quarters = torch.where(torch.rand(200, generator=torch.Generator().manual_seed(2)) < share, 3, 0)
-    monkeypatch.setattr(hinge_lessons, "_bodies", lambda *_: _drawn(quarters))
+    monkeypatch.setattr(hinge_lessons, "_bodies", lambda _, clouds: _drawn(quarters[: len(clouds)]))
     learn_hinge_sides(box_module, torch.zeros(200, POINTS, 3))
     sides = box_module.hinge_sides
     assert bool(sides.learnt) == learnt
@@ -242,9 +242,17 @@ def test_some_that_lie_are_learnt(box_module, monkeypatch, share, learnt):
         assert sides.surface is None
 
 
+def test_nothing_is_learnt_where_too_little_is_seen(box_module, monkeypatch):
+    unknown = _drawn(torch.zeros(64))._replace(known=torch.arange(64) < 50)
+    monkeypatch.setattr(hinge_lessons, "_bodies", lambda *_: unknown)
+    monkeypatch.setattr(hinge_lessons, "teach", None)
+    learn_hinge_sides(box_module, torch.zeros(100, POINTS, 3))
+    assert not box_module.hinge_sides.learnt
+
+
 def test_lessons_turn_what_the_network_disagrees_with(box_module, monkeypatch):
     quarters = (torch.arange(100) % 10 == 0) * 1
-    monkeypatch.setattr(hinge_lessons, "_bodies", lambda *_: _drawn(quarters))
+    monkeypatch.setattr(hinge_lessons, "_bodies", lambda _, clouds: _drawn(quarters[: len(clouds)]))
     given = []
     monkeypatch.setattr(hinge_lessons, "teach", lambda lessons, _: given.append(lessons) or _TopIsUp())
     learn_hinge_sides(box_module, torch.zeros(100, POINTS, 3))
