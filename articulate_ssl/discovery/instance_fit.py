@@ -30,7 +30,7 @@ _START = 0.95  # of the bound: a start beyond is one here, where the gradient st
 _RIDGE = 1e-3  # weight of the squared log-stretch: decides what the clouds leave open
 _HELD = 0.1  # weight of the squared distance that a cloud's own joint lines go from where they started. Chosen.
 # Weight of how far parts are from the line of a joint between them, by the mean of that many nearest points of each.
-# They may be as far as in the template, but for what is less or more than is likely (docs/experiments.md, step 125).
+# They may be as far as in the template, within the bounds of the slack (docs/experiments.md, step 125).
 _TOUCH, _NEAREST = 0.3, 8
 _SLACK = (0.02, 0.05)
 _RATE = 0.01  # of Adam, at the start

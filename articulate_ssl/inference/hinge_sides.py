@@ -130,7 +130,12 @@ class HingeSides(nn.Module):
         prediction: Prediction,  # joint states count from the closed door
         dense: Tensor,  # [B, P, 3]
     ) -> Prediction:
-        """The same, its frame turned so that the body looks right; its margin is at most how sure that is."""
+        """The same, its frame turned so that the body looks right; its margin is at most how sure that is.
+
+        Where less is seen of a body than the network reads, nothing is decided.
+        """
+        if dense.shape[1] < SHOWN:
+            return prediction
         bodies = self.bodies(prediction, dense, (dense,))
         odds = (self.looks_right(bodies) + self.log_prior.to(dense)) * bodies.known[:, None]
         best, turns = odds.topk(2, dim=1)
