@@ -1,4 +1,4 @@
-"""Boxes whose door is hinged at another side than that of most objects: ovens at the side, safes on the right.
+"""Boxes whose door is hinged at another side than that of most objects: one oven in nine is.
 
 A category has one joint. An oven that is hinged at its side is explained as well by one that lies on its side, hinged
 below, and only the body tells which it is. So of a prediction everything in camera space stays, and its frame is turned
