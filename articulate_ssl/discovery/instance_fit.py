@@ -80,7 +80,7 @@ class InstanceFit:
         self.axes = axes
         self._axes = torch.eye(3).to(base).repeat(shape.num_parts, 1, 1) if axes is None else axes
         self._center = shape.points.mean(dim=0)
-        self._slack: Tensor | None = None  # [n, 2 J] how far parts may be from the lines of their joints
+        self._slack: Tensor | None = None  # [n, 2 J] how far parts may be from the lines of joints that draw them
         self._measure_parts()
 
     @property
@@ -147,9 +147,8 @@ class InstanceFit:
         own = own if self.axes is None else [*own, self._beside]
         own = own if self._start is None else [*own, self._pivot]
         parameters = lines + own if shared else own
-        if touching:
-            self._slack = self._to_lines(self._shape.points.expand(len(self._base), -1, -1), self._joints())
-            self._slack = self._slack.clamp(*_SLACK)
+        template = self._shape.points.expand(len(self._base), -1, -1)
+        self._slack = self._to_lines(template, self._joints()).clamp(*_SLACK) if touching else None
         optimizer = torch.optim.Adam([p.requires_grad_() for p in parameters], lr=_RATE)
         for cycle in range(cycles):
             for group in optimizer.param_groups:
@@ -157,7 +156,7 @@ class InstanceFit:
             for _ in range(steps):
                 optimizer.zero_grad()
                 with torch.enable_grad():
-                    self._loss(clouds, keep, bidirectional, touching).backward()
+                    self._loss(clouds, keep, bidirectional).backward()
                 optimizer.step()
                 self._state.data = self._shape.joints.clamped(self._state.data)
             if shared:
@@ -213,7 +212,7 @@ class InstanceFit:
         axis = functional.normalize(self._axis, dim=-1)
         return replace(self._shape.joints, axis=axis, pivot=self._pivot)
 
-    def _loss(self, clouds: Tensor, keep: float, bidirectional: bool, touching: bool) -> Tensor:
+    def _loss(self, clouds: Tensor, keep: float, bidirectional: bool) -> Tensor:
         rows = self._draw(len(self._shape.label), clouds.device)
         posed, seen = self.posed(rows), clouds[:, self._draw(clouds.shape[1], clouds.device)]
         error = _softened(_distance(seen, posed)).mean(dim=1)
@@ -223,7 +222,7 @@ class InstanceFit:
         ridge = _RIDGE * (self._stretch.square().sum() + self._beside.square().sum())
         if self._start is not None:
             ridge = ridge + _HELD * (self._pivot - self._start).square().sum()
-        if touching:
+        if self._slack is not None:
             ridge = ridge + _TOUCH * self._apart().sum()
         return error[counts].sum() + ridge
 

@@ -20,14 +20,14 @@ from typing import NamedTuple
 import roma
 import torch
 from scipy.spatial import ConvexHull
-from torch import Tensor, nn
+from torch import Tensor
 
 from articulate_ssl.discovery.manhattan_frame import manhattan_frames
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.screw import REVOLUTE, screw_motion
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.inference.prediction import Prediction
-from articulate_ssl.inference.surface_decision import LOOKS, SIZE, SurfaceDecision
+from articulate_ssl.inference.surface_decision import LOOKS, SIZE, WithSurface
 from articulate_ssl.network.surface_network import SurfaceCloud
 from articulate_ssl.ops.chamfer import nearest_distance
 from articulate_ssl.ops.spin_images import SPIN_CHANNELS, spin_images
@@ -59,7 +59,7 @@ class Bodies(NamedTuple):
     known: Tensor
 
 
-class HingeSides(nn.Module):
+class HingeSides(WithSurface):
     """At which side objects are hinged, in quarter turns about the door's normal from where most are.
 
     Attributes:
@@ -71,8 +71,6 @@ class HingeSides(nn.Module):
         surface: How right a body looks.
     """
 
-    surface: SurfaceDecision | None
-
     def __init__(self) -> None:
         super().__init__()
         self.register_buffer("learnt", torch.tensor(False))
@@ -80,7 +78,6 @@ class HingeSides(nn.Module):
         self.register_buffer("axes", torch.eye(3))
         self.register_buffer("door", torch.zeros(3))
         self.register_buffer("log_prior", torch.zeros(TURNS))
-        self.register_module("surface", None)
 
     def measure(self, shape: ArticulatedShape, state_range: Tensor) -> None:
         """Find axes and the closed door of a category's shape with one joint.
@@ -179,14 +176,6 @@ class HingeSides(nn.Module):
         described = [_described(version, own) for version in versions]
         points, surface = (torch.stack(some) for some in zip(*described, strict=True))
         return Bodies(points, surface, frames, known)
-
-    def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
-        """Weights from before know of no other sides, and a network only those that were taught one."""
-        taught = any(name.startswith(f"{prefix}surface.") for name in state_dict)
-        self.surface = (self.surface or SurfaceDecision().to(self.axes).requires_grad_(False)) if taught else None
-        for name, value in self.named_buffers(recurse=False):
-            state_dict.setdefault(prefix + name, value.clone())
-        super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
 def turned_about(

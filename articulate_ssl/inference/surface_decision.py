@@ -64,3 +64,24 @@ class SurfaceDecision(SurfaceNetwork):
         own = (slice(first, None, looks) for first in range(looks))
         odds = [self.odds(SurfaceCloud.of(points[:, k], images[:, k], normal[:, k], self.size), frames) for k in own]
         return torch.stack(odds).mean(dim=0)
+
+
+class WithSurface(nn.Module):
+    """What decides by a network if one was taught.
+
+    Weights from before something was learnt lack it: buffers then stay as they are.
+    """
+
+    surface: SurfaceDecision | None
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_module("surface", None)
+
+    def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
+        like = next(buffer for buffer in self.buffers() if buffer.is_floating_point())
+        taught = any(name.startswith(f"{prefix}surface.") for name in state_dict)
+        self.surface = (self.surface or SurfaceDecision().to(like).requires_grad_(False)) if taught else None
+        for name, value in self.named_buffers(recurse=False):
+            state_dict.setdefault(prefix + name, value.clone())
+        super()._load_from_state_dict(state_dict, prefix, *rest)

@@ -29,10 +29,10 @@ import logging
 import numpy as np
 import roma
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from articulate_ssl.geometry.se3 import invert_se3, se3
-from articulate_ssl.inference.surface_decision import SurfaceDecision
+from articulate_ssl.inference.surface_decision import WithSurface
 
 _ALIKE = np.radians(25)  # rotations closer than this are the same twin
 # Of the clouds, that must have the same twin; and by how much their two explanations may differ in fit. Chosen.
@@ -53,7 +53,7 @@ _ROUNDS = 50  # of discriminant analysis at most; a handful is taken
 log = logging.getLogger(__name__)
 
 
-class TwoWays(nn.Module):
+class TwoWays(WithSurface):
     """The twin of an explanation, and which of the two is right.
 
     Attributes:
@@ -65,8 +65,6 @@ class TwoWays(nn.Module):
         surface: The network, if there is one; without `learnt` it decides between predictions and their rivals.
     """
 
-    surface: SurfaceDecision | None
-
     def __init__(self, num_parts: int, num_features: int) -> None:
         super().__init__()
         self.register_buffer("learnt", torch.tensor(False))
@@ -74,7 +72,6 @@ class TwoWays(nn.Module):
         self.register_buffer("turn", torch.eye(4).repeat(num_parts, 1, 1))
         self.register_buffer("scale", torch.ones(num_features))
         self.register_buffer("weight", torch.zeros(num_features))
-        self.register_module("surface", None)
 
     def twin_poses(
         self,
@@ -138,14 +135,6 @@ class TwoWays(nn.Module):
         self.weight.copy_(torch.from_numpy(weight))
         self.learnt.fill_(True)
         return True
-
-    def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
-        """Weights from before there was a decision have none, and a network only those that were taught one."""
-        taught = any(name.startswith(f"{prefix}surface.") for name in state_dict)
-        self.surface = (self.surface or SurfaceDecision().to(self.weight).requires_grad_(False)) if taught else None
-        for name, value in self.named_buffers(recurse=False):
-            state_dict.setdefault(prefix + name, value.clone())
-        super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
 def decision_direction(

@@ -210,7 +210,7 @@ def test_where_too_little_is_behind_the_door_nothing_is_decided():
 
 @pytest.fixture
 def box_module(monkeypatch):
-    """A module whose bodies are drawn: sixty clouds in a hundred stand, and `_TopIsUp` is all that it ever learns."""
+    """A module that ever learns the same of its lessons: `_TopIsUp`."""
     module = tiny_module(num_parts=2).eval()
     monkeypatch.setattr(hinge_lessons, "FEWEST", 20)
     monkeypatch.setattr(hinge_lessons, "teach", lambda *_: _TopIsUp())
