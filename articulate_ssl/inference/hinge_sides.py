@@ -1,4 +1,4 @@
-"""Boxes whose door is hinged at another side than that of most objects: one oven in nine is.
+"""Boxes whose door is hinged at another side than that of most objects: one oven in nine is, one safe in sixteen.
 
 A category has one joint. An oven that is hinged at its side is explained as well by one that lies on its side, hinged
 below, and only the body tells which it is. So of a prediction everything in camera space stays, and its frame is turned
@@ -8,6 +8,10 @@ A network says how right the body looks (`surface_decision`). It learns that fro
 and without labels; the few that are wrong it would learn as well, if it could tell by anything where the hinge is. So
 it sees nothing of that: frames are each cloud's own axes at right angles (`manhattan_frame`), which differ by exact
 quarter turns, and of the points only those of the body that lie behind the door's plane.
+
+Some bodies say nothing, but doors do: of a safe the lock is above the handle. Where a door is hinged on the other side,
+objects are explained upside down; and who sees every object in the mirror as often as it is does not know at which side
+its hinge is. So there, all of a cloud is seen, as it is and in the mirror, and half turns are told.
 """
 
 from __future__ import annotations
@@ -28,14 +32,15 @@ from articulate_ssl.geometry.screw import REVOLUTE, screw_motion
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.inference.surface_decision import LOOKS, SIZE, WithSurface
-from articulate_ssl.network.surface_network import SurfaceCloud
+from articulate_ssl.network.surface_network import SurfaceCloud, SurfaceSize
 from articulate_ssl.ops.chamfer import nearest_distance
 from articulate_ssl.ops.spin_images import SPIN_CHANNELS, spin_images
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.object_axes import object_axes
 
 TURNS = 4  # quarter turns: sides that a door may be hinged at
-SHOWN = LOOKS * SIZE.read  # points of a body that are known
+# What reads bodies. Reading 512 points, it keeps every lying oven lying (docs/experiments.md, step 129).
+BODY_SIZE = SurfaceSize(read=256, centers=128)
 # Behind the closed door's plane, in normalised units. Nearer, door and body are not told apart well enough to hide
 # where the hinge is: with .04 fewer are found (docs/experiments.md, step 124).
 _BEHIND = 0.12
@@ -43,11 +48,11 @@ _CLOSED_REACH = math.radians(120)  # from the middle of the joint's range: the c
 
 
 class Bodies(NamedTuple):
-    """What is seen of B bodies, in V versions of their clouds, without their doors.
+    """What is seen of B bodies, in V versions of their clouds, without their doors; or of all of the clouds.
 
     Attributes:
-        points: [V, B, SHOWN, 3] camera space.
-        surface: [V, B, SHOWN, SPIN_CHANNELS + 3] spin images and normals, in float16.
+        points: [V, B, S, 3] camera space; S is what the network reads in all its looks.
+        surface: [V, B, S, SPIN_CHANNELS + 3] spin images and normals, in float16.
         frames: [B, TURNS, 3, 3] frame -> camera: of the box as it is predicted, hinge first and door's normal last, and
             the same turned about the latter by one, two and three quarters.
         known: [B] whether enough of the body is seen.
@@ -62,22 +67,38 @@ class Bodies(NamedTuple):
 class HingeSides(WithSurface):
     """At which side objects are hinged, in quarter turns about the door's normal from where most are.
 
+    Of W ways there are `TURNS`, or as it is and upside down where all is seen.
+
     Attributes:
+        whole: [] whether all of a cloud is seen, and in the mirror.
         learnt: [] whether some objects are hinged elsewhere. Then joint states count from the closed door.
         closed: [] joint state at which the door is closed, of predictions before.
         axes: [3, 3] columns: of the object's box in canonical space, the door's normal last, pointing at the body.
         door: [3] canonical space, the middle of the closed door.
-        log_prior: [TURNS] logarithm of the share of objects that are to be turned so.
+        log_prior: [TURNS] logarithm of the share of objects that are to be turned so; as many as there are ways count.
         surface: How right a body looks.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.register_buffer("learnt", torch.tensor(False))
+        self.register_buffer("whole", torch.tensor(False))
         self.register_buffer("closed", torch.tensor(0.0))
         self.register_buffer("axes", torch.eye(3))
         self.register_buffer("door", torch.zeros(3))
         self.register_buffer("log_prior", torch.zeros(TURNS))
+
+    @property
+    def size(self) -> SurfaceSize:
+        """Of the network that was taught, or is to be."""
+        if self.surface is not None:
+            return self.surface.size
+        return SIZE if self.whole else BODY_SIZE
+
+    @property
+    def quarters(self) -> Tensor:  # [W]
+        """By how many quarters the ways are turned."""
+        return torch.arange(0, TURNS, 2 if self.whole else 1, device=self.closed.device)
 
     def measure(self, shape: ArticulatedShape, state_range: Tensor) -> None:
         """Find axes and the closed door of a category's shape with one joint.
@@ -131,24 +152,28 @@ class HingeSides(WithSurface):
 
         Where less is seen of a body than the network reads, nothing is decided.
         """
-        if dense.shape[1] < SHOWN:
+        if dense.shape[1] < LOOKS * self.size.read:
             return prediction
         bodies = self.bodies(prediction, dense, (dense,))
-        odds = (self.looks_right(bodies) + self.log_prior.to(dense)) * bodies.known[:, None]
-        best, turns = odds.topk(2, dim=1)
-        sure = torch.where(bodies.known, (best[:, 0] - best[:, 1]) / 2, torch.inf).tanh()
-        quarters = torch.where(bodies.known, turns[:, 0], 0)
+        odds = self.looks_right(bodies) + self.log_prior[: len(self.quarters)].to(dense)
+        best, ways = odds.topk(2, dim=1)
+        sure = (best[:, 0] - best[:, 1]) / (2 * self.surface.temperature)
+        sure = torch.where(bodies.known, sure, torch.inf).tanh()
+        quarters = torch.where(bodies.known, self.quarters[ways[:, 0]], 0)
         turned = turned_about(prediction, bodies.frames[:, 0, :, 2], quarters)
         return replace(turned, margin=prediction.margin.minimum(sure))
 
-    def looks_right(self, bodies: Bodies) -> Tensor:  # [B, TURNS]
-        """How right bodies look, as they are, in each of their frames."""
-        looks = []
+    def looks_right(self, bodies: Bodies) -> Tensor:  # [B, W]
+        """How right bodies look, as they are, in each of their ways."""
+        frames, looks = bodies.frames[:, self.quarters], []
+        if self.whole:
+            mirror = torch.tensor([1.0, -1.0, 1.0]).to(frames)
+            frames = torch.cat([frames, frames * mirror], dim=1)
         for first in range(LOOKS):
             points, surface = (x[0, :, first::LOOKS].to(bodies.frames) for x in bodies[:2])
             images, normal = surface.split([SPIN_CHANNELS, 3], dim=-1)
-            seen = SurfaceCloud.of(points, images, normal, SIZE).seen_in(bodies.frames)
-            looks.append(self.surface.seen(seen).unflatten(0, (-1, TURNS)))
+            seen = SurfaceCloud.of(points, images, normal, self.size).seen_in(frames)
+            looks.append(self.surface.seen(seen).view(len(frames), -1, len(self.quarters)).mean(dim=1))
         return torch.stack(looks).mean(dim=0)
 
     def bodies(
@@ -158,6 +183,7 @@ class HingeSides(WithSurface):
         versions: Sequence[Tensor],  # of [B, P, 3] the same points, as they are or with noise
     ) -> Bodies:
         """What is seen of clouds' bodies."""
+        shown = LOOKS * self.size.read
         axes = manhattan_frames(dense, torch.Generator().manual_seed(0))[0].mT
         every = axes[:, None] @ rotation_group(24).elements.to(axes)  # the same axes in every order
         said = prediction.base_pose[:, :3, :3] @ self.axes.to(axes)
@@ -166,16 +192,27 @@ class HingeSides(WithSurface):
         quarter = torch.tensor([0.0, 0.0, math.pi / 2]).to(box) * torch.arange(TURNS).to(box)[:, None]
         frames = box[:, None] @ roma.rotvec_to_rotmat(quarter)
 
-        door = transform_points(prediction.base_pose, self.door.to(axes).expand(len(axes), 1, 3))
-        behind = ((dense - door) @ box[:, :, 2, None]).squeeze(-1) > _BEHIND
-        posed = [transform_points(prediction.part_pose[:, k], prediction.part_shape[:, k]) for k in range(2)]
-        to_part = torch.stack([nearest_distance(dense, part) for part in posed], dim=-1)
-        own = behind & (to_part.argmin(dim=-1) == int(prediction.joint_parent[0, 0]))
-        known = own.sum(dim=1) >= SHOWN
+        own = torch.ones_like(dense[..., 0], dtype=torch.bool)
+        if not self.whole:
+            own = self._behind_the_door(prediction, dense, box[:, :, 2])
+        known = own.sum(dim=1) >= shown
         own |= ~known[:, None]  # of these nothing is decided
-        described = [_described(version, own) for version in versions]
+        described = [_described(version, own, shown) for version in versions]
         points, surface = (torch.stack(some) for some in zip(*described, strict=True))
         return Bodies(points, surface, frames, known)
+
+    def _behind_the_door(
+        self,
+        prediction: Prediction,
+        dense: Tensor,  # [B, P, 3]
+        normal: Tensor,  # [B, 3] of the doors, pointing at the bodies
+    ) -> Tensor:  # [B, P] bool
+        """Which points are of the body and behind the closed door."""
+        door = transform_points(prediction.base_pose, self.door.to(dense).expand(len(dense), 1, 3))
+        behind = ((dense - door) @ normal[..., None]).squeeze(-1) > _BEHIND
+        posed = [transform_points(prediction.part_pose[:, k], prediction.part_shape[:, k]) for k in range(2)]
+        to_part = torch.stack([nearest_distance(dense, part) for part in posed], dim=-1)
+        return behind & (to_part.argmin(dim=-1) == int(prediction.joint_parent[0, 0]))
 
 
 def turned_about(
@@ -205,13 +242,14 @@ def turned_about(
 
 def _described(
     clouds: Tensor,  # [B, P, 3]
-    own: Tensor,  # [B, P] bool, at least SHOWN of each
-) -> tuple[Tensor, Tensor]:  # [B, SHOWN, 3], [B, SHOWN, SPIN_CHANNELS + 3]
+    own: Tensor,  # [B, P] bool, at least so many of each as are shown
+    shown: int,
+) -> tuple[Tensor, Tensor]:  # [B, S, 3], [B, S, SPIN_CHANNELS + 3]
     """The leading points of the bodies, and their surface as it is without the doors."""
     points, surface = [], []
     for cloud, mine in zip(clouds, own, strict=True):
         body = cloud[None, mine]
-        points.append(body[:, :SHOWN])
+        points.append(body[:, :shown])
         surface.append(torch.cat(spin_images(points[-1], body), dim=-1).half())
     return torch.cat(points), torch.cat(surface)
 

@@ -9,13 +9,18 @@ wrong in the same way each time, what they get right is, and that is what a netw
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor, nn
 
 from articulate_ssl.network.surface_network import SurfaceCloud, SurfaceNetwork, SurfaceSize
 from articulate_ssl.ops.spin_images import spin_images
 
-SIZE = SurfaceSize()
+# Of safes seen whole, a network that was taught with labels called one in ten upside down where it read 256 points, one
+# in 24 where it reads 512 (docs/experiments.md, step 129).
+SIZE = SurfaceSize(read=512, centers=256)
+_ONCE_READ = 256  # by networks whose weights do not say
 LOOKS = 2  # at other points of the cloud, whose odds are averaged; four and eight decide alike
 
 
@@ -23,6 +28,7 @@ class SurfaceDecision(SurfaceNetwork):
     """How right clouds look in some frame.
 
     Attributes:
+        read: [] points of a cloud that it was taught to read, which weights say.
         temperature: [] by which odds are to be divided before they are believed (Guo et al. 2017): a network that is
             taught to the end is surer than it is right. Which explanation is likelier does not depend on it.
     """
@@ -31,6 +37,7 @@ class SurfaceDecision(SurfaceNetwork):
         """Args: sizes."""
         super().__init__(size)
         self.size = size
+        self.register_buffer("read", torch.tensor(size.read))
         self.right = nn.Linear(size.head_dim, 1)
         self.register_buffer("temperature", torch.tensor(1.0))
 
@@ -57,9 +64,8 @@ class SurfaceDecision(SurfaceNetwork):
         dense: Tensor,  # [B, P, 3] farthest-point order
     ) -> Tensor:  # [B]
         """`odds` of whole clouds, averaged over looks at different points."""
-        read = self.size.read
-        looks = max(1, min(LOOKS, dense.shape[1] // read))
-        points = dense[:, : looks * read]
+        looks = max(1, min(LOOKS, dense.shape[1] // self.size.read))
+        points = dense[:, : looks * self.size.read]
         images, normal = spin_images(points, dense)
         own = (slice(first, None, looks) for first in range(looks))
         odds = [self.odds(SurfaceCloud.of(points[:, k], images[:, k], normal[:, k], self.size), frames) for k in own]
@@ -80,8 +86,11 @@ class WithSurface(nn.Module):
 
     def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
         like = next(buffer for buffer in self.buffers() if buffer.is_floating_point())
-        taught = any(name.startswith(f"{prefix}surface.") for name in state_dict)
-        self.surface = (self.surface or SurfaceDecision().to(like).requires_grad_(False)) if taught else None
+        self.surface = None
+        if any(name.startswith(f"{prefix}surface.") for name in state_dict):
+            read = int(state_dict.setdefault(f"{prefix}surface.read", torch.tensor(_ONCE_READ)))
+            size = replace(SIZE, read=read, centers=read // 2)
+            self.surface = SurfaceDecision(size).to(like).requires_grad_(False)
         for name, value in self.named_buffers(recurse=False):
             state_dict.setdefault(prefix + name, value.clone())
         super()._load_from_state_dict(state_dict, prefix, *rest)

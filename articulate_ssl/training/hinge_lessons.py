@@ -1,24 +1,27 @@
 """How `inference.hinge_sides` is learnt: from predictions of training clouds, most of which stand as they should.
 
-No label is read. A network is taught that bodies stand right as they are predicted and wrong when they are turned, all
+No label is read. A network is taught that objects stand right as they are predicted and wrong when they are turned, all
 of them, though of ovens one in nine lies on its side. What it disagrees with is turned, and it is taught anew, twice:
 it then stands more than nine in ten of the lying ovens up and turns over one in fifty others (docs/experiments.md,
-step 124).
+step 124). First it is shown bodies; if all of these seem to stand alike, whole clouds and their mirror images
+(step 129).
 """
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from articulate_ssl.geometry.screw import REVOLUTE
-from articulate_ssl.inference.hinge_sides import TURNS, Bodies
+from articulate_ssl.inference.hinge_sides import Bodies
+from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.ops.progress import announced
 from articulate_ssl.training.explanations import registered_points, with_noise
-from articulate_ssl.training.surface_lessons import FEWEST, TAUGHT, Lessons, teach
+from articulate_ssl.training.surface_lessons import FEWEST, TAUGHT, Lessons, believable, teach
 
 if TYPE_CHECKING:
     from articulate_ssl.training.module import ArticulatedPoseModule
@@ -30,6 +33,7 @@ _FIRST, _KNOWN = 64, 0.9
 # Shares of the clouds that the network was not taught by. Chosen: fewer that are turned are not worth a network; more
 # would mean that most are not right; and one that cannot tell sides apart is undecided of many.
 _LEAST_TURNED, _MOST_TURNED, _MOST_UNDECIDED, _DECIDED = 0.02, 0.4, 0.15, 2.0
+_ALIKE = 0.005  # share of those that a lesson turns, below which another one turns none. Chosen.
 _RARE = 1e-3  # least share of a side
 _SHARES = 50  # rounds of expectation and maximisation
 
@@ -44,49 +48,73 @@ def learn_hinge_sides(
     """Find out whether some objects are hinged at another side than most."""
     sides, network = module.estimator.hinge_sides, module.articulated
     sides.learnt.fill_(False)  # of a run that ended and goes on
+    sides.whole.fill_(False)
     sides.surface = None
     if network.num_parts != 2 or network.joint_type != REVOLUTE or TAUGHT * len(clouds) < FEWEST:
         return
     sides.measure(network.category.articulated_shape(network.joint_type), module.states.limits)
-    if _bodies(module, clouds[:_FIRST]).known.double().mean() < _KNOWN:
+    predictions = _predictions(module, clouds[:_FIRST])
+    if _bodies(module, clouds[:_FIRST], predictions).known.double().mean() < _KNOWN:
         log.info("hinge sides: too little is seen behind the closed door")
         return
-    bodies = _bodies(module, clouds)
+    predictions += _predictions(module, clouds[_FIRST:])
+    for whole in (False, True):
+        sides.surface = None
+        sides.whole.fill_(whole)
+        if _learnt(module, _bodies(module, clouds, predictions)):
+            sides.learnt.fill_(True)
+            return
+    sides.surface = None
+
+
+def _learnt(module: ArticulatedPoseModule, bodies: Bodies) -> bool:
+    """Whether lessons about what is seen tell some sides from most, and few are undecided."""
+    sides = module.estimator.hinge_sides
     known = bodies.known.nonzero()[:, 0]
-    bodies = _rows(bodies, known)
-    order = torch.randperm(len(known), generator=torch.Generator().manual_seed(0)).to(known.device)
+    order = known[torch.randperm(len(known), generator=torch.Generator().manual_seed(0)).to(known.device)]
     count = int(TAUGHT * len(order))
     taught, rest = _rows(bodies, order[:count]), _rows(bodies, order[count:])
-    every = torch.arange(count, device=order.device)
+    every, ways = torch.arange(count, device=order.device)[:, None], torch.arange(len(sides.quarters)).to(order)
     turned = torch.zeros_like(every)
     for lesson in range(1, _ROUNDS + 1):
-        ways = (turned[:, None] + torch.arange(TURNS, device=order.device)) % TURNS
-        frames = taught.frames[every[:, None], ways]
-        sides.surface = teach(
-            Lessons(taught.points, taught.surface, frames), f"which side is up, {lesson} of {_ROUNDS}"
-        )
-        turned = _odds(module, taught).argmax(dim=1)
-    odds = _odds(module, rest)
-    share = _shares(odds)
-    sides.log_prior.copy_(share.log())
-    best = (odds + sides.log_prior.to(odds)).topk(2, dim=1).values
-    undecided, other = float((best[:, 0] - best[:, 1] < _DECIDED).double().mean()), float(1 - share[0])
-    log.info(
-        "hinge sides: %s %% of the clouds, undecided %.0f %%", (100 * share).round().int().tolist(), 100 * undecided
-    )
-    if _LEAST_TURNED <= other <= _MOST_TURNED and undecided <= _MOST_UNDECIDED:
-        sides.learnt.fill_(True)
-    else:
-        sides.surface = None
+        frames = taught.frames[every, sides.quarters[(turned + ways) % len(ways)]]
+        lessons = Lessons(taught.points, taught.surface, frames, mirrored=bool(sides.whole))
+        sides.surface = teach(lessons, f"which side is up, {lesson} of {_ROUNDS}", sides.size)
+        odds = _odds(module, rest)
+        share = _shares(odds)
+        believed = odds + share.log()
+        best = believed.topk(2, dim=1).values
+        undecided, other = float((best[:, 0] - best[:, 1] < _DECIDED).double().mean()), float(1 - share[0])
+        percent = (100 * share).round().int().tolist()
+        seen = "whole clouds" if sides.whole else "bodies"
+        log.info("hinge sides, by %s: %s %% of the clouds, undecided %.0f %%", seen, percent, 100 * undecided)
+        if other < _ALIKE:
+            return False
+        if lesson < _ROUNDS:
+            turned = _odds(module, taught).argmax(dim=1, keepdim=True)
+    sides.log_prior.zero_()
+    sides.log_prior[: len(share)] = share.log()
+    # As surely as what is predicted is right, which most is.
+    sides.surface.temperature.copy_(believable(believed[:, 0] - believed[:, 1:].logsumexp(dim=1)))
+    return _LEAST_TURNED <= other <= _MOST_TURNED and undecided <= _MOST_UNDECIDED
 
 
-def _bodies(module: ArticulatedPoseModule, clouds: Tensor) -> Bodies:
-    """What is seen of the bodies of training clouds, as they are and with noise."""
-    estimator, generator, found = module.estimator, torch.Generator().manual_seed(0), []
-    for some in announced(log, "hinge sides, bodies without doors", clouds.split(_BATCH)):
-        points = some[:, : registered_points(module)]
-        prediction = estimator.predict_with_rivals(points, module.num_points, dense=some, fits=False)[0]
-        found.append(estimator.hinge_sides.bodies(prediction, some, (some, with_noise(some, generator))))
+def _predictions(module: ArticulatedPoseModule, clouds: Tensor) -> list[Prediction]:
+    """Of training clouds, by batches."""
+    count = registered_points(module)
+    return [
+        module.estimator.predict_with_rivals(some[:, :count], module.num_points, dense=some, fits=False)[0]
+        for some in announced(log, "hinge sides, predictions", clouds.split(_BATCH))
+    ]
+
+
+def _bodies(module: ArticulatedPoseModule, clouds: Tensor, predictions: Sequence[Prediction]) -> Bodies:
+    """What is seen of training clouds, as they are and with noise."""
+    sides, generator, found = module.estimator.hinge_sides, torch.Generator().manual_seed(0), []
+    for some, prediction in zip(
+        announced(log, "hinge sides, surfaces", clouds.split(_BATCH)), predictions, strict=True
+    ):
+        found.append(sides.bodies(prediction, some, (some, with_noise(some, generator))))
     points, surface, frames, known = zip(*found, strict=True)
     return Bodies(torch.cat(points, dim=1), torch.cat(surface, dim=1), torch.cat(frames), torch.cat(known))
 
@@ -97,14 +125,14 @@ def _rows(bodies: Bodies, rows: Tensor) -> Bodies:
 
 
 def _odds(module: ArticulatedPoseModule, bodies: Bodies) -> Tensor:
-    """How right they look in each of their frames [n, TURNS]."""
+    """How right they look in each of their ways [n, W]."""
     chunks = torch.arange(len(bodies.known), device=bodies.known.device).split(_CHUNK)
     return torch.cat([module.estimator.hinge_sides.looks_right(_rows(bodies, rows)) for rows in chunks])
 
 
 def _shares(odds: Tensor) -> Tensor:
-    """How many clouds are to be turned by each of the turns [TURNS], by expectation maximisation."""
-    share = torch.full_like(odds[0], 1 / TURNS)
+    """How many clouds are to be turned each way [W], by expectation maximisation."""
+    share = torch.full_like(odds[0], 1 / odds.shape[1])
     for _ in range(_SHARES):
         share = (odds + share.log()).softmax(dim=1).mean(dim=0).clamp_min(_RARE)
     return share / share.sum()

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from articulate_ssl.inference.surface_decision import SIZE, SurfaceDecision
-from articulate_ssl.network.surface_network import SurfaceCloud
+from articulate_ssl.network.surface_network import SurfaceCloud, SurfaceSize
 from articulate_ssl.ops.progress import announced
 from articulate_ssl.ops.spin_images import SPIN_CHANNELS, spin_images
 
@@ -47,11 +47,13 @@ class Lessons:
         points: [V, n, N, 3] V versions of each cloud: as it is, with noise.
         surface: [V, n, N, SPIN_CHANNELS + 3] float16, spin images and normals.
         frames: [n, S, 3, 3] the right one first.
+        mirrored: Every look is in a mirror half of the times, with the frames' second axis reversed.
     """
 
     points: Tensor
     surface: Tensor
     frames: Tensor
+    mirrored: bool = False
 
     @staticmethod
     @torch.no_grad()
@@ -67,20 +69,20 @@ class Lessons:
         ways = (len(versions), -1)
         return Lessons(dense[:, :count].unflatten(0, ways), torch.cat(surface).unflatten(0, ways), frames)
 
-    def draw(self, count: int, read: int, generator: torch.Generator) -> tuple[SurfaceCloud, Tensor]:
+    def draw(self, count: int, size: SurfaceSize, generator: torch.Generator) -> tuple[SurfaceCloud, Tensor]:
         """Some of the clouds, in versions and of points drawn anew; and the right and a wrong frame of each."""
         versions, clouds, shown, _ = self.points.shape
         chosen = torch.randperm(clouds, generator=generator)[:count, None]
         version = torch.randint(versions, chosen.shape, generator=generator)
         # In farthest-point order again, so that what is left after a layer is even.
-        seen = torch.rand(len(chosen), shown, generator=generator).argsort(dim=1)[:, :read].sort(dim=1).values
+        seen = torch.rand(len(chosen), shown, generator=generator).argsort(dim=1)[:, : size.read].sort(dim=1).values
         points, surface = (x[version, chosen, seen].to(self.points) for x in (self.points, self.surface))
         images, normal = surface.split([SPIN_CHANNELS, 3], dim=-1)
         frames = self.frames[chosen[:, 0]]
         if frames.shape[1] > 2:
             wrong = torch.randint(1, frames.shape[1], (len(frames),), generator=generator)
             frames = torch.stack([frames[:, 0], frames[torch.arange(len(frames)), wrong]], dim=1)
-        return SurfaceCloud.of(points, images, normal, SIZE), frames
+        return SurfaceCloud.of(points, images, normal, size), frames
 
 
 def learn_surface(
@@ -109,27 +111,38 @@ def learn_surface(
     if agrees < least:
         log.warning("that is too few: no network decides")
         return None
-    temperatures = torch.logspace(-1, 2, _TEMPERATURES).to(odds)
-    surprise = functional.softplus(-odds[:, None] / temperatures).mean(dim=0)
-    decision.temperature.copy_(temperatures[surprise.argmin()])
+    decision.temperature.copy_(believable(odds))
     return decision
 
 
-def teach(lessons: Lessons, work: str = "a network learns to decide") -> SurfaceDecision:
-    """A new network that has learnt them; `work` is what progress is called."""
+def believable(odds: Tensor) -> Tensor:
+    """The temperature [] at which the odds [m] of what is held to be right surprise the least."""
+    temperatures = torch.logspace(-1, 2, _TEMPERATURES).to(odds)
+    return temperatures[functional.softplus(-odds[:, None] / temperatures).mean(dim=0).argmin()]
+
+
+def teach(
+    lessons: Lessons, work: str = "a network learns to decide", size: SurfaceSize | None = None
+) -> SurfaceDecision:
+    """A new network that has learnt them.
+
+    Args:
+        work: What progress is called.
+        size: Of the network; None is that of a decision between two explanations.
+    """
+    size = size or SIZE
     device = lessons.points.device
     generator = torch.Generator().manual_seed(0)
     steps = math.ceil(TIMES * lessons.points.shape[1] / BATCH)
     with torch.random.fork_rng(devices=[]), torch.enable_grad():
         torch.manual_seed(0)
-        decision = SurfaceDecision(SIZE).to(device)
+        decision = SurfaceDecision(size).to(device)
         optimizer = torch.optim.AdamW(decision.parameters(), lr=RATE, weight_decay=_DECAY)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
         for _ in announced(log, work, range(steps)):
-            cloud, frames = lessons.draw(BATCH, SIZE.read, generator)
-            one, other = (
-                decision.seen(_varied(cloud.seen_in(_turned(frames, generator)), generator)).view(-1, 2).unbind(1)
-            )
+            cloud, frames = lessons.draw(BATCH, size, generator)
+            shown = _varied(cloud.seen_in(_turned(frames, generator)), lessons.mirrored, generator)
+            one, other = decision.seen(shown).view(-1, 2).unbind(1)
             loss = functional.softplus(other - one).mean()
             optimizer.zero_grad()
             loss.backward()
@@ -145,7 +158,9 @@ def _turned(frames: Tensor, generator: torch.Generator) -> Tensor:
     return frames @ roma.rotvec_to_rotmat(vector).to(frames)
 
 
-def _varied(seen: SurfaceCloud, generator: torch.Generator) -> SurfaceCloud:
-    """Clouds as they are seen, in other proportions along the axes of their frames."""
+def _varied(seen: SurfaceCloud, mirrored: bool, generator: torch.Generator) -> SurfaceCloud:
+    """Clouds as they are seen, in other proportions along the axes of their frames, and some in the mirror."""
     stretch = (_STRETCH * torch.randn(len(seen.points), 1, 3, generator=generator)).exp().to(seen.points)
+    if mirrored:
+        stretch[torch.rand(len(stretch), generator=generator) < 0.5, :, 1] *= -1
     return seen._replace(points=seen.points * stretch, normal=functional.normalize(seen.normal / stretch, dim=-1))

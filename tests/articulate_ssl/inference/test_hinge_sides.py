@@ -10,14 +10,16 @@ from tiny import POINTS, tiny_module
 from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.geometry.screw import REVOLUTE, screw_motion
 from articulate_ssl.geometry.se3 import se3, transform_points
-from articulate_ssl.inference.hinge_sides import SHOWN, TURNS, Bodies, HingeSides, turned_about
+from articulate_ssl.inference.hinge_sides import BODY_SIZE, TURNS, Bodies, HingeSides, turned_about
 from articulate_ssl.inference.prediction import Prediction
-from articulate_ssl.inference.surface_decision import SurfaceDecision
+from articulate_ssl.inference.surface_decision import LOOKS, SIZE, SurfaceDecision
+from articulate_ssl.network.surface_network import SurfaceSize
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.joints import Joints
 from articulate_ssl.training import hinge_lessons
 from articulate_ssl.training.hinge_lessons import learn_hinge_sides
 
+TINY = SurfaceSize(read=48, centers=32, dims=(8, 8), radii=(0.3, 0.5), num_neighbors=8, global_dim=16, head_dim=16)
 QUARTER = math.pi / 2
 ZERO = -1.9  # joint state at which the door is closed
 HINGE, PIVOT = torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, -0.3, -0.26])
@@ -33,9 +35,11 @@ def _on_box(size: torch.Tensor, count: int, generator: torch.Generator) -> torch
     return points * size
 
 
-def _parts(generator: torch.Generator, count: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Points of the body, with something on its top (+y), and of the closed door at its front (-z)."""
-    top = torch.tensor([0.0, 0.34, 0.1]) + _on_box(torch.tensor([0.3, 0.08, 0.2]), count // 5, generator)
+def _parts(generator: torch.Generator, count: int, up: int = 1) -> tuple[torch.Tensor, torch.Tensor]:
+    """Points of the body, with something on its top (+y, or +x), and of the closed door at its front (-z)."""
+    place, size = torch.tensor([0.0, 0.34, 0.1]), torch.tensor([0.3, 0.08, 0.2])
+    order = [1, 0, 2] if up == 0 else [0, 1, 2]
+    top = place[order] + _on_box(size[order], count // 5, generator)
     body = torch.cat([_on_box(BODY, count - count // 5, generator), top])
     return body, _on_box(DOOR, count // 3, generator) + torch.tensor([0.0, 0.0, -0.26])
 
@@ -59,19 +63,26 @@ def _sides() -> HingeSides:
 class _TopIsUp(torch.nn.Module):
     """Looks right to it what has more above: its mean, where points count from, is nearer to its upper end."""
 
+    def __init__(self, up: int = 1, size: SurfaceSize = BODY_SIZE):
+        super().__init__()
+        self.size = size
+        self.up = up
+        self.register_buffer("temperature", torch.tensor(1.0))
+
     def seen(self, cloud):
-        up = cloud.points[..., 1]
+        up = cloud.points[..., self.up]
         return -2000 * (up.amax(dim=1) + up.amin(dim=1))
 
 
 def _lying(
     quarters: list[int],  # by which the frame of each of B objects is to be turned
     opened: float = 1.2,
+    up: int = 1,
 ) -> tuple[Prediction, torch.Tensor, torch.Tensor]:
     """Predictions by the one joint there is, dense clouds, and the true rotations canonical -> camera."""
     generator, shape = torch.Generator().manual_seed(3), _shape()
     count = len(quarters)
-    body, door = _parts(generator, 3000)
+    body, door = _parts(generator, 3000, up)
     base = se3(roma.random_rotmat(count), torch.rand(count, 3, generator=generator))
     state = torch.full((count, 1), ZERO + opened)
     sides = _sides()
@@ -168,10 +179,53 @@ def test_a_lying_object_stands_up():
     _holds(decided)
     off = roma.rotmat_geodesic_distance(decided.base_pose[:, :3, :3], true).rad2deg()
     assert off.max() < 2
+    # Where odds are not to be believed to the letter, they are the same way, less sure.
+    sides.surface.temperature.fill_(1e6)
+    unsure = sides.decided(sides.counted_from_closed(prediction), dense)
+    torch.testing.assert_close(unsure.base_pose, decided.base_pose)
+    assert (unsure.margin < decided.margin).all()
     # Rarely seen sides take more to be believed.
     sides.log_prior.copy_(torch.tensor([0.0, -1e3, -1e3, -1e3]))
     kept = sides.decided(sides.counted_from_closed(prediction), dense)
     torch.testing.assert_close(kept.base_pose, prediction.base_pose)
+
+
+def test_upside_down_is_told_by_whole_clouds_too():
+    prediction, dense, true = _lying([0, 2, 2], up=0)
+    sides = _sides()
+    sides.whole.fill_(True)
+    sides.surface = _TopIsUp(up=0, size=SIZE)
+    decided = sides.decided(sides.counted_from_closed(prediction), dense)
+    _same_in_camera_space(decided, prediction)
+    off = roma.rotmat_geodesic_distance(decided.base_pose[:, :3, :3], true).rad2deg()
+    assert off.max() < 2
+    bodies = sides.bodies(prediction, dense, (dense,))
+    assert bodies.known.all()
+    torch.testing.assert_close(bodies.points[0], dense[:, : LOOKS * SIZE.read])  # doors, too
+
+
+def test_in_whole_clouds_it_does_not_show_at_which_side_a_hinge_is():
+    """What looks right is the same of a cloud and of its mirror image, whatever the network."""
+    torch.manual_seed(0)
+    sides = _sides()
+    sides.whole.fill_(True)
+    sides.surface = SurfaceDecision(TINY).requires_grad_(False)
+    prediction, dense, _ = _lying([0, 2])
+    bodies = sides.bodies(prediction, dense, (dense,))
+    mirror = torch.diag(torch.tensor([1.0, -1.0, 1.0]))
+    across = bodies.frames[:, 0] @ mirror @ bodies.frames[:, 0].mT  # camera space
+    points, surface = bodies.points @ across.mT, bodies.surface.clone()
+    surface[..., -3:] = (surface[..., -3:].float() @ across.mT).half()
+    looks = sides.looks_right(bodies)
+    assert looks.shape == (2, 2) and (looks[:, 0] - looks[:, 1]).abs().min() > 1e-3
+    torch.testing.assert_close(
+        sides.looks_right(bodies._replace(points=points, surface=surface)), looks, atol=1e-3, rtol=0
+    )
+    # Seen as it is only, it shows.
+    sides.whole.fill_(False)
+    bodies = bodies._replace(frames=bodies.frames + 0.0)
+    alone = sides.looks_right(bodies._replace(points=points, surface=surface)) - sides.looks_right(bodies)
+    assert alone.abs().max() > 1e-2
 
 
 def test_nothing_seen_of_a_body_says_where_its_door_is():
@@ -185,7 +239,7 @@ def test_nothing_seen_of_a_body_says_where_its_door_is():
         prediction = turned_about(prediction, prediction.base_pose[:, :3, 2], torch.zeros(1))
         tilted = Prediction(**{**prediction.__dict__, "base_pose": prediction.base_pose @ tilt})
         bodies = sides.bodies(tilted, dense, (dense, dense + 0.001))
-        assert bodies.known.all() and bodies.points.shape == (2, 1, SHOWN, 3)
+        assert bodies.known.all() and bodies.points.shape == (2, 1, LOOKS * BODY_SIZE.read, 3)
         own = (bodies.points[0, 0] - prediction.base_pose[0, :3, 3]) @ prediction.base_pose[0, :3, :3]
         assert own[:, 2].min() > -0.26 + 0.05  # behind the door's plane, and none of an open door before it
         assert own[:, :2].abs().amax() < 0.39
@@ -214,12 +268,13 @@ def box_module(monkeypatch):
     module = tiny_module(num_parts=2).eval()
     monkeypatch.setattr(hinge_lessons, "FEWEST", 20)
     monkeypatch.setattr(hinge_lessons, "teach", lambda *_: _TopIsUp())
+    monkeypatch.setattr(hinge_lessons, "_predictions", lambda *_: [])
     return module
 
 
-def _drawn(quarters: torch.Tensor) -> Bodies:
-    body = _parts(torch.Generator().manual_seed(0), 3000)[0]
-    body = body[torch.randperm(len(body), generator=torch.Generator().manual_seed(1))[:SHOWN]]
+def _drawn(quarters: torch.Tensor, up: int = 1) -> Bodies:
+    body = _parts(torch.Generator().manual_seed(0), 3000, up)[0]
+    body = body[torch.randperm(len(body), generator=torch.Generator().manual_seed(1))[: LOOKS * SIZE.read]]
     axes = _sides().axes
     turn = roma.rotvec_to_rotmat(quarters[:, None] * QUARTER * axes[:, 2])
     points = (body @ turn.mT)[None]
@@ -231,7 +286,7 @@ def _drawn(quarters: torch.Tensor) -> Bodies:
 @pytest.mark.parametrize(("share", "learnt"), [(0.12, True), (0.0, False), (0.6, False)], ids=["some", "none", "most"])
 def test_some_that_lie_are_learnt(box_module, monkeypatch, share, learnt):
     quarters = torch.where(torch.rand(200, generator=torch.Generator().manual_seed(2)) < share, 3, 0)
-    monkeypatch.setattr(hinge_lessons, "_bodies", lambda _, clouds: _drawn(quarters[: len(clouds)]))
+    monkeypatch.setattr(hinge_lessons, "_bodies", lambda _, clouds, __: _drawn(quarters[: len(clouds)]))
     learn_hinge_sides(box_module, torch.zeros(200, POINTS, 3))
     sides = box_module.hinge_sides
     assert bool(sides.learnt) == learnt
@@ -251,11 +306,11 @@ def test_nothing_is_learnt_where_too_little_is_seen(box_module, monkeypatch):
 
 
 def test_lessons_turn_what_the_network_disagrees_with(box_module, monkeypatch):
-    quarters = (torch.arange(100) % 10 == 0) * 1
-    monkeypatch.setattr(hinge_lessons, "_bodies", lambda _, clouds: _drawn(quarters[: len(clouds)]))
+    quarters = torch.where(torch.rand(200, generator=torch.Generator().manual_seed(2)) < 0.12, 1, 0)
+    monkeypatch.setattr(hinge_lessons, "_bodies", lambda _, clouds, __: _drawn(quarters[: len(clouds)]))
     given = []
-    monkeypatch.setattr(hinge_lessons, "teach", lambda lessons, _: given.append(lessons) or _TopIsUp())
-    learn_hinge_sides(box_module, torch.zeros(100, POINTS, 3))
+    monkeypatch.setattr(hinge_lessons, "teach", lambda lessons, *_: given.append(lessons) or _TopIsUp())
+    learn_hinge_sides(box_module, torch.zeros(200, POINTS, 3))
     first, *later = (lessons.frames[:, 0] for lessons in given)
     assert len(later) == 2 and (first == first[0]).all()  # as all are predicted
     for frames in later:
@@ -264,14 +319,33 @@ def test_lessons_turn_what_the_network_disagrees_with(box_module, monkeypatch):
         torch.testing.assert_close(given[0].frames.sum(dim=1), given[1].frames.sum(dim=1))
 
 
+@pytest.mark.parametrize("hidden", [False, True], ids=["bodies tell", "bodies do not"])
+def test_whole_clouds_are_shown_where_all_bodies_seem_to_stand_alike(box_module, monkeypatch, hidden):
+    quarters = torch.where(torch.rand(200, generator=torch.Generator().manual_seed(2)) < 0.12, 2, 0)
+    sides, given, up = box_module.hinge_sides, [], 0 if hidden else 1
+
+    def seen(_, clouds, __):
+        return _drawn(quarters[: len(clouds)] * (0 if hidden and not sides.whole else 1), up)
+
+    monkeypatch.setattr(hinge_lessons, "_bodies", seen)
+    monkeypatch.setattr(hinge_lessons, "teach", lambda lessons, *_: given.append(lessons) or _TopIsUp(up))
+    learn_hinge_sides(box_module, torch.zeros(200, POINTS, 3))
+    assert sides.learnt and bool(sides.whole) == hidden
+    # One lesson says that nothing is told by bodies.
+    assert [lessons.mirrored for lessons in given] == ([False, True, True, True] if hidden else [False] * 3)
+    assert [lessons.frames.shape[1] for lessons in given] == ([4, 2, 2, 2] if hidden else [4] * 3)
+    assert float(sides.log_prior.exp()[1 if hidden else 2]) == pytest.approx(0.12, abs=0.08)
+
+
 def test_it_is_part_of_the_weights_and_older_ones_have_none():
     module = tiny_module(num_parts=2)
     module.hinge_sides.surface = SurfaceDecision().requires_grad_(False)
     module.hinge_sides.learnt.fill_(True)
+    module.hinge_sides.whole.fill_(True)
     module.hinge_sides.closed.fill_(0.7)
     other = tiny_module(num_parts=2)
     other.load_state_dict(module.state_dict())
-    assert other.hinge_sides.learnt and other.hinge_sides.surface is not None
+    assert other.hinge_sides.learnt and other.hinge_sides.whole and other.hinge_sides.surface is not None
     torch.testing.assert_close(other.state_range, other.states.limits - 0.7)
     older = {name: value for name, value in module.state_dict().items() if "hinge_sides" not in name}
     other.load_state_dict(older)

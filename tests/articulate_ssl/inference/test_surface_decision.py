@@ -72,6 +72,16 @@ def test_weights_bring_the_network_and_weights_without_take_it_away():
     assert other.surface is None
 
 
+def test_weights_say_how_many_points_were_read_and_older_ones_read_256():
+    taught, other = TwoWays(2, 4), TwoWays(2, 4)
+    taught.surface = SurfaceDecision(SurfaceSize(read=96, centers=48)).requires_grad_(False)
+    other.load_state_dict(taught.state_dict())
+    assert (other.surface.size.read, other.surface.size.centers) == (96, 48)
+    older = {name: value for name, value in taught.state_dict().items() if name != "surface.read"}
+    other.load_state_dict(older)
+    assert (other.surface.size.read, other.surface.size.centers) == (256, 128)
+
+
 def test_what_is_learnt_after_the_last_step_is_not_optimised():
     """A run that ended and goes on has the optimiser of its beginning."""
     module = tiny_module()

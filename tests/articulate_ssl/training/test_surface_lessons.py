@@ -84,11 +84,25 @@ def test_lessons_are_the_same_every_time_and_leave_the_random_state_alone(monkey
     assert not any(parameter.requires_grad for parameter in first.parameters())
 
 
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_looks_are_in_the_mirror_half_of_the_times(mirrored):
+    """Points and their normals alike; of what is not to be mirrored, nothing is."""
+    clouds, frames = wedges(200, 0)
+    cloud, own = Lessons.of([clouds], frames).draw(200, TINY, torch.Generator().manual_seed(0))
+    seen = cloud.seen_in(own)
+    varied = surface_lessons._varied(seen, mirrored, torch.Generator().manual_seed(0))
+    sign = (varied.points * seen.points).sum(dim=1).sign()
+    assert (sign[:, [0, 2]] == 1).all()
+    assert (sign[:, 1] < 0).double().mean() == pytest.approx(0.5 if mirrored else 0, abs=0.1)
+    flipped = (varied.normal[..., 1] * seen.normal[..., 1]).sum(dim=1) < 0
+    assert torch.equal(flipped, sign[:, 1] < 0)
+
+
 def test_drawn_clouds_are_those_of_their_frames():
     """Whatever the version and the points drawn, in the right frame the thick end is where it is."""
     clouds, frames = wedges(20, 0)
     lessons = Lessons.of([clouds, clouds + 1e-3], frames)
-    cloud, own = lessons.draw(20, TINY.read, torch.Generator().manual_seed(0))
+    cloud, own = lessons.draw(20, TINY, torch.Generator().manual_seed(0))
     assert cloud.points.shape == (20, TINY.read, 3)
     seen = cloud.seen_in(own[:, :1]).points
     thick, thin = (seen[..., 2].abs() * (sign * seen[..., 0] > 0.1) for sign in (1, -1))
