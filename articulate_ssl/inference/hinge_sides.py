@@ -71,8 +71,9 @@ class HingeSides(WithSurface):
 
     Attributes:
         whole: [] whether all of a cloud is seen, and in the mirror.
-        learnt: [] whether some objects are hinged elsewhere. Then joint states count from the closed door.
-        closed: [] joint state at which the door is closed, of predictions before.
+        learnt: [] whether some objects are hinged elsewhere. Then joint states count from `closed`.
+        closed: [] joint state at which the door is closed, of predictions before; 0 once half turns alone are told, as
+            mirror images are closed by as much.
         axes: [3, 3] columns: of the object's box in canonical space, the door's normal last, pointing at the body.
         door: [3] canonical space, the middle of the closed door.
         log_prior: [TURNS] logarithm of the share of objects that are to be turned so; as many as there are ways count.

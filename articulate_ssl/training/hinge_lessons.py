@@ -3,8 +3,8 @@
 No label is read. A network is taught that objects stand right as they are predicted and wrong when they are turned, all
 of them, though of ovens one in nine lies on its side. What it disagrees with is turned, and it is taught anew, twice:
 it then stands more than nine in ten of the lying ovens up and turns over one in fifty others (docs/experiments.md,
-step 124). First it is shown bodies; if all of these seem to stand alike, whole clouds and their mirror images
-(step 129).
+step 124). If all bodies seem to stand alike, it is taught anew by whole clouds and their mirror images, once, and each
+lesson is doubted: three without doubt teach no more (step 130).
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from articulate_ssl.training.module import ArticulatedPoseModule
 
 _BATCH, _CHUNK = 16, 64
-_ROUNDS = 3  # of lessons
+_ROUNDS = 3  # of lessons about bodies
+_DOUBT = 0.06  # share of the lessons about whole clouds that may be wrong
 # Share of the first clouds in which enough of the body is seen, without which nothing is learnt. Chosen.
 _FIRST, _KNOWN = 64, 0.9
 # Shares of the clouds that the network was not taught by. Chosen: fewer that are turned are not worth a network; more
@@ -61,9 +62,12 @@ def learn_hinge_sides(
     for whole in (False, True):
         sides.surface = None
         sides.whole.fill_(whole)
-        if _learnt(module, _bodies(module, clouds, predictions)):
-            sides.learnt.fill_(True)
-            return
+        if not _learnt(module, _bodies(module, clouds, predictions)):
+            continue
+        if whole:
+            sides.closed.zero_()  # what is upside down is a mirror image, whose door is as far from closed
+        sides.learnt.fill_(True)
+        return
     sides.surface = None
 
 
@@ -76,21 +80,21 @@ def _learnt(module: ArticulatedPoseModule, bodies: Bodies) -> bool:
     taught, rest = _rows(bodies, order[:count]), _rows(bodies, order[count:])
     every, ways = torch.arange(count, device=order.device)[:, None], torch.arange(len(sides.quarters)).to(order)
     turned = torch.zeros_like(every)
-    for lesson in range(1, _ROUNDS + 1):
+    seen, rounds, doubt = ("whole clouds", 1, _DOUBT) if sides.whole else ("bodies", _ROUNDS, 0.0)
+    for lesson in range(1, rounds + 1):
         frames = taught.frames[every, sides.quarters[(turned + ways) % len(ways)]]
-        lessons = Lessons(taught.points, taught.surface, frames, mirrored=bool(sides.whole))
-        sides.surface = teach(lessons, f"which side is up, {lesson} of {_ROUNDS}", sides.size)
+        lessons = Lessons(taught.points, taught.surface, frames, bool(sides.whole), doubt)
+        sides.surface = teach(lessons, f"which side is up, {lesson} of {rounds}", sides.size)
         odds = _odds(module, rest)
         share = _shares(odds)
         believed = odds + share.log()
         best = believed.topk(2, dim=1).values
         undecided, other = float((best[:, 0] - best[:, 1] < _DECIDED).double().mean()), float(1 - share[0])
         percent = (100 * share).round().int().tolist()
-        seen = "whole clouds" if sides.whole else "bodies"
         log.info("hinge sides, by %s: %s %% of the clouds, undecided %.0f %%", seen, percent, 100 * undecided)
         if other < _ALIKE:
             return False
-        if lesson < _ROUNDS:
+        if lesson < rounds:
             turned = _odds(module, taught).argmax(dim=1, keepdim=True)
     sides.log_prior.zero_()
     sides.log_prior[: len(share)] = share.log()

@@ -48,12 +48,14 @@ class Lessons:
         surface: [V, n, N, SPIN_CHANNELS + 3] float16, spin images and normals.
         frames: [n, S, 3, 3] the right one first.
         mirrored: Every look is in a mirror half of the times, with the frames' second axis reversed.
+        doubt: Share of the lessons that may be wrong. What contradicts all others is then not learnt by heart.
     """
 
     points: Tensor
     surface: Tensor
     frames: Tensor
     mirrored: bool = False
+    doubt: float = 0.0
 
     @staticmethod
     @torch.no_grad()
@@ -143,13 +145,21 @@ def teach(
             cloud, frames = lessons.draw(BATCH, size, generator)
             shown = _varied(cloud.seen_in(_turned(frames, generator)), lessons.mirrored, generator)
             one, other = decision.seen(shown).view(-1, 2).unbind(1)
-            loss = functional.softplus(other - one).mean()
+            loss = -_believed(one - other, lessons.doubt).mean()
             optimizer.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(decision.parameters(), _GRADIENT_NORM)
             optimizer.step()
             schedule.step()
     return decision.eval().requires_grad_(False)
+
+
+def _believed(odds: Tensor, doubt: float) -> Tensor:
+    """Logarithm of the probability that a lesson says what it says, which may be wrong."""
+    if doubt == 0:
+        return functional.logsigmoid(odds)
+    right, wrong = functional.logsigmoid(odds), functional.logsigmoid(-odds)
+    return torch.logaddexp(right + math.log1p(-doubt), wrong + math.log(doubt))
 
 
 def _turned(frames: Tensor, generator: torch.Generator) -> Tensor:

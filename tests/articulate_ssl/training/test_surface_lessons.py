@@ -98,6 +98,16 @@ def test_looks_are_in_the_mirror_half_of_the_times(mirrored):
     assert torch.equal(flipped, sign[:, 1] < 0)
 
 
+def test_what_is_doubted_contradicts_no_more_than_that_is_improbable():
+    odds = torch.tensor([-100.0, -3.0, 0.0, 3.0, 100.0], dtype=torch.float64, requires_grad=True)
+    believed = surface_lessons._believed(odds, 0.1)
+    expected = (0.9 * odds.sigmoid() + 0.1 * (-odds).sigmoid()).log()
+    torch.testing.assert_close(believed, expected)
+    believed.sum().backward()
+    assert odds.grad[0].abs() < 1e-6 and odds.grad[1] > 0.1
+    torch.testing.assert_close(surface_lessons._believed(odds, 0.0), odds.sigmoid().log(), atol=1e-5, rtol=1e-5)
+
+
 def test_drawn_clouds_are_those_of_their_frames():
     """Whatever the version and the points drawn, in the right frame the thick end is where it is."""
     clouds, frames = wedges(20, 0)
