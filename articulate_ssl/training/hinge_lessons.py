@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 _BATCH, _CHUNK = 16, 64
 _ROUNDS = 3  # of lessons about bodies
-_DOUBT = 0.06  # share of the lessons about whole clouds that may be wrong
+_DOUBT = 0.06  # share of the lessons about whole clouds that may be wrong. No other was tried.
 # Share of the first clouds in which enough of the body is seen, without which nothing is learnt. Chosen.
 _FIRST, _KNOWN = 64, 0.9
 # Shares of the clouds that the network was not taught by. Chosen: fewer that are turned are not worth a network; more
