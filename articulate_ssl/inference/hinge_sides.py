@@ -39,7 +39,7 @@ from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.object_axes import object_axes
 
 TURNS = 4  # quarter turns: sides that a door may be hinged at
-# What reads bodies. Reading 512 points, it keeps every lying oven lying (docs/experiments.md, step 129).
+# What reads bodies; more points were not tried to the end (docs/experiments.md, step 133).
 BODY_SIZE = SurfaceSize(read=256, centers=128)
 # Behind the closed door's plane, in normalised units. Nearer, door and body are not told apart well enough to hide
 # where the hinge is: with .04 fewer are found (docs/experiments.md, step 124).

@@ -34,7 +34,6 @@ _FIRST, _KNOWN = 64, 0.9
 # Shares of the clouds that the network was not taught by. Chosen: fewer that are turned are not worth a network; more
 # would mean that most are not right; and one that cannot tell sides apart is undecided of many.
 _LEAST_TURNED, _MOST_TURNED, _MOST_UNDECIDED, _DECIDED = 0.02, 0.4, 0.15, 2.0
-_ALIKE = 0.005  # share of those that a lesson turns, below which another one turns none. Chosen.
 _RARE = 1e-3  # least share of a side
 _SHARES = 50  # rounds of expectation and maximisation
 
@@ -85,17 +84,15 @@ def _learnt(module: ArticulatedPoseModule, bodies: Bodies) -> bool:
         frames = taught.frames[every, sides.quarters[(turned + ways) % len(ways)]]
         lessons = Lessons(taught.points, taught.surface, frames, bool(sides.whole), doubt)
         sides.surface = teach(lessons, f"which side is up, {lesson} of {rounds}", sides.size)
-        odds = _odds(module, rest)
-        share = _shares(odds)
-        believed = odds + share.log()
-        best = believed.topk(2, dim=1).values
-        undecided, other = float((best[:, 0] - best[:, 1] < _DECIDED).double().mean()), float(1 - share[0])
-        percent = (100 * share).round().int().tolist()
-        log.info("hinge sides, by %s: %s %% of the clouds, undecided %.0f %%", seen, percent, 100 * undecided)
-        if other < _ALIKE:
-            return False
         if lesson < rounds:
             turned = _odds(module, taught).argmax(dim=1, keepdim=True)
+    odds = _odds(module, rest)
+    share = _shares(odds)
+    believed = odds + share.log()
+    best = believed.topk(2, dim=1).values
+    undecided, other = float((best[:, 0] - best[:, 1] < _DECIDED).double().mean()), float(1 - share[0])
+    percent = (100 * share).round().int().tolist()
+    log.info("hinge sides, by %s: %s %% of the clouds, undecided %.0f %%", seen, percent, 100 * undecided)
     sides.log_prior.zero_()
     sides.log_prior[: len(share)] = share.log()
     # As surely as what is predicted is right, which most is.

@@ -331,9 +331,8 @@ def test_whole_clouds_are_shown_where_all_bodies_seem_to_stand_alike(box_module,
     monkeypatch.setattr(hinge_lessons, "teach", lambda lessons, *_: given.append(lessons) or _TopIsUp(up))
     learn_hinge_sides(box_module, torch.zeros(200, POINTS, 3))
     assert sides.learnt and bool(sides.whole) == hidden
-    # One lesson says that nothing is told by bodies.
-    assert [lessons.mirrored for lessons in given] == ([False, True] if hidden else [False] * 3)
-    assert [lessons.frames.shape[1] for lessons in given] == ([4, 2] if hidden else [4] * 3)
+    assert [lessons.mirrored for lessons in given] == [False] * 3 + [True] * hidden
+    assert [lessons.frames.shape[1] for lessons in given] == [4] * 3 + [2] * hidden
     assert [lessons.doubt > 0 for lessons in given] == [lessons.mirrored for lessons in given]
     assert (float(sides.closed) == 0) == hidden
     assert float(sides.log_prior.exp()[1 if hidden else 2]) == pytest.approx(0.12, abs=0.08)
