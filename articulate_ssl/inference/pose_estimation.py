@@ -13,7 +13,7 @@
 4. *Decision*, where a category's clouds can be explained in two ways that fit alike: the relief of the surface decides
    between the winner and its twin (`two_ways`), which is registered, too, if the winner was. Where fits tell them
    apart, a network that they taught decides between the winner and its rival (`surface_decision`).
-5. *Side*, where some doors are hinged at another side than most: frames are turned so that bodies look right
+5. *Side*, where some doors are hinged at another side than most: frames are turned so that what is seen looks right
    (`hinge_sides`).
 6. *Hand*, where upright cameras see objects and their mirror images: clouds are explained in a mirror, too, and how
    well either explains them decides (`handedness`).

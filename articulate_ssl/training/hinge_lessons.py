@@ -67,6 +67,7 @@ def learn_hinge_sides(
             sides.closed.zero_()  # what is upside down is a mirror image, whose door is as far from closed
         sides.learnt.fill_(True)
         return
+    sides.whole.fill_(False)
     sides.surface = None
 
 

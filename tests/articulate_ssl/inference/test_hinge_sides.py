@@ -223,7 +223,6 @@ def test_in_whole_clouds_it_does_not_show_at_which_side_a_hinge_is():
     )
     # Seen as it is only, it shows.
     sides.whole.fill_(False)
-    bodies = bodies._replace(frames=bodies.frames + 0.0)
     alone = sides.looks_right(bodies._replace(points=points, surface=surface)) - sides.looks_right(bodies)
     assert alone.abs().max() > 1e-2
 
