@@ -28,7 +28,9 @@ _SOFTNESS = 0.05
 _BOUND = 0.35
 _START = 0.95  # of the bound: a start beyond is one here, where the gradient still lives
 _RIDGE = 1e-3  # weight of the squared log-stretch: decides what the clouds leave open
-_HELD = 0.1  # weight of the squared distance that a cloud's own joint lines go from where they started. Chosen.
+# Weight of the squared distance that a cloud's own joint lines go from where they started, and where the state of a
+# joint is known: with nothing to make up for, a line that is free is placed worse (docs/experiments.md, step 135).
+_HELD, _HELD_KNOWN = 0.1, 1.0
 # Weight of how far parts are from the line of a joint between them, by the mean of that many nearest points of each.
 # They may be as far as in the template, within the bounds of the slack (docs/experiments.md, step 125).
 _TOUCH, _NEAREST = 0.3, 8
@@ -54,6 +56,7 @@ class InstanceFit:
         state: [n, J] start.
         generator: Of the points drawn.
         axes: [K, 3, 3] columns along which parts stretch instead; joint axes then stay as they are.
+        faces: [K, 3, 3] columns along which parts stretch instead, and nothing else.
         log_stretch: [n, K, 3] start; none by default.
         beside: [n, K, 3] start of where parts lie beside their slide, with `axes`; none by default.
     """
@@ -67,18 +70,21 @@ class InstanceFit:
         axes: Tensor | None = None,
         log_stretch: Tensor | None = None,
         beside: Tensor | None = None,
+        faces: Tensor | None = None,
     ) -> None:
         self._shape, self._base, self._generator = shape, base, generator
         self._axis, self._pivot, self._state = shape.joints.axis.clone(), shape.joints.pivot.clone(), state.clone()
         self._turn, self._shift = (base.new_zeros(len(base), 3) for _ in range(2))
         self._start = self._pivot.clone() if self._pivot.dim() == 3 else None
+        self._held = _HELD
         self._stretch, self._beside = (base.new_zeros(len(base), shape.num_parts, 3) for _ in range(2))
         if log_stretch is not None:
             self._stretch += _BOUND * (log_stretch / _BOUND).clamp(-_START, _START).atanh()
         if beside is not None:
             self._beside += beside
-        self.axes = axes
-        self._axes = torch.eye(3).to(base).repeat(shape.num_parts, 1, 1) if axes is None else axes
+        self.axes, given = axes, faces if axes is None else axes
+        self._principal = given is None
+        self._axes = torch.eye(3).to(base).repeat(shape.num_parts, 1, 1) if given is None else given
         self._center = shape.points.mean(dim=0)
         self._slack: Tensor | None = None  # [n, 2 J] how far parts may be from the lines of joints that draw them
         self._measure_parts()
@@ -133,6 +139,7 @@ class InstanceFit:
         keep: float = 1.0,
         bidirectional: bool = True,
         touching: bool = False,
+        known: tuple[Tensor, Tensor] | None = None,
     ) -> None:
         """Descend for `cycles` times `steps` steps; with `shared`, also joint lines, and labels after every cycle.
 
@@ -140,6 +147,7 @@ class InstanceFit:
             keep: Share of the clouds, best fitted first, that count.
             bidirectional: The clouds show all sides, so that each of the template's points must be near them, too.
             touching: Both parts of a joint are drawn to its line, as by the paper's joint regularization.
+            known: [n] bool, whether clouds stay turned as they are, and [n, J] bool, whether joint states stay.
         """
         own = [self._state, self._turn, self._shift, self._stretch]
         # In a frame that clouds have in common, what slides slides along one of its axes, exactly.
@@ -149,6 +157,8 @@ class InstanceFit:
         parameters = lines + own if shared else own
         template = self._shape.points.expand(len(self._base), -1, -1)
         self._slack = self._to_lines(template, self._joints()).clamp(*_SLACK) if touching else None
+        if known is not None:
+            self._held = torch.where(known[1], _HELD_KNOWN, _HELD)
         optimizer = torch.optim.Adam([p.requires_grad_() for p in parameters], lr=_RATE)
         for cycle in range(cycles):
             for group in optimizer.param_groups:
@@ -157,6 +167,9 @@ class InstanceFit:
                 optimizer.zero_grad()
                 with torch.enable_grad():
                     self._loss(clouds, keep, bidirectional).backward()
+                if known is not None:
+                    self._turn.grad[known[0]] = 0
+                    self._state.grad[known[1]] = 0
                 optimizer.step()
                 self._state.data = self._shape.joints.clamped(self._state.data)
             if shared:
@@ -221,7 +234,7 @@ class InstanceFit:
         counts = error.detach() <= error.detach().quantile(keep)
         ridge = _RIDGE * (self._stretch.square().sum() + self._beside.square().sum())
         if self._start is not None:
-            ridge = ridge + _HELD * (self._pivot - self._start).square().sum()
+            ridge = ridge + (self._held * (self._pivot - self._start).square().sum(dim=-1)).sum()
         if self._slack is not None:
             ridge = ridge + _TOUCH * self._apart().sum()
         return error[counts].sum() + ridge
@@ -252,7 +265,7 @@ class InstanceFit:
             points = self._shape.part(part)
             if len(points) < MIN_POINTS:
                 continue
-            if self.axes is None:
+            if self._principal:
                 self._axes[part] = principal_directions(points)
             if part == self._shape.joints.chain.root:
                 self._center = points.mean(dim=0)

@@ -5,7 +5,7 @@
    cloud in the part frames of the last winner (paper, Sec. 3.1).
 3. *Registration* at test time: the leading hypotheses' predicted shapes are registered to the cloud without leaving
    their joints, and the best reconstruction wins. What is decided for in the end takes the cloud's own proportions
-   (`proportions`).
+   (`proportions`), turned as its parts' faces say (`part_frames`).
    Where parts slide, clouds of other objects that are most like it decide which way round it is; where these are
    labelled, they say which parts points are of, and where the category's shape is (`sliding_search`).
    Where simulated views taught, those that a view is most like decide which way round it is, and say with the
@@ -50,6 +50,7 @@ from articulate_ssl.inference.handedness import Handedness, in_the_mirror
 from articulate_ssl.inference.hinge_sides import HingeSides
 from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.inference.packaging import as_prediction
+from articulate_ssl.inference.part_frames import PartFrames
 from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.inference.proportions import fit_proportions
 from articulate_ssl.inference.relief import NUM_FEATURES, relief_of
@@ -85,6 +86,7 @@ class PoseEstimator:
         view_search: The search among simulated views, if there were any; a module owns it.
         handedness: Whether clouds show the category's mirror image, if some do; a module owns it.
         hinge_sides: At which side objects are hinged, if not all at the same; a module owns it.
+        part_frames: How the faces of parts lie; a module owns it.
         states: Which joint states training clouds showed; a module owns it.
     """
 
@@ -108,6 +110,7 @@ class PoseEstimator:
         self.handedness = Handedness()
         self.hinge_sides = HingeSides()
         self.states = StateRange(articulated.num_parts - 1)
+        self.part_frames = PartFrames(articulated.num_parts)
 
     def align(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Stage 0: clouds turned roughly to canonical orientation [B, N, 3], and the pose [B, 4, 4] that undoes it."""
@@ -226,22 +229,41 @@ class PoseEstimator:
         Proportions make up for the wrong hand.
         """
         with torch.autocast(points.device.type, enabled=False):
-            registers, votes = (self.inference.refine if refine is None else refine) is not False, None
-            if registers and self.view_search.learnt:
-                chosen, other, margin, votes = self._seen(points, num_points)
-            elif registers and dense is not None and self.sliding.learnt:
-                chosen, other, margin, votes = self._slid(points, dense, num_points)
-            else:
-                chosen, other, margin = self._best(self._candidates(points, num_points, registers))
-            if dense is not None and self.two_ways.learnt:
-                chosen, other, margin = self._decided(chosen, points, dense, registers, self.two_ways.surface)
-            elif dense is not None and self.two_ways.surface is not None:
-                chosen, other, margin = self._preferred(chosen, other, margin, points, dense, registers)
+            registers = (self.inference.refine if refine is None else refine) is not False
+            chosen, other, margin, votes = self._chosen(points, num_points, registers, dense)
             error = self._distance(chosen, points)
             if registers and fits:
-                chosen = self._in_proportion(chosen, points)
+                chosen = self._in_proportion(chosen, points, dense)
             rival = self._packaged(other, points, torch.zeros_like(margin))
             return self._packaged(chosen, points, margin, votes), rival, error
+
+    @torch.no_grad()
+    def explained(
+        self,
+        points: Tensor,  # [B, N, 3] normalised, farthest-point order
+        num_points: int,
+        dense: Tensor,  # [B, P, 3] the same clouds with all their points
+    ) -> Hypotheses:  # H = 1
+        """What is decided for, registered, before it takes clouds' proportions: from which `part_frames` learn."""
+        with torch.autocast(points.device.type, enabled=False):
+            return self._chosen(points, num_points, True, dense)[0]
+
+    def _chosen(
+        self, points: Tensor, num_points: int, registers: bool, dense: Tensor | None
+    ) -> tuple[Hypotheses, Hypotheses, Tensor, Tensor | None]:  # H = 1, H = 1, [B], [B, N, K]
+        """What is decided for, its rival, the margin between them, and parts of points as labelled clouds vote."""
+        votes = None
+        if registers and self.view_search.learnt:
+            chosen, other, margin, votes = self._seen(points, num_points)
+        elif registers and dense is not None and self.sliding.learnt:
+            chosen, other, margin, votes = self._slid(points, dense, num_points)
+        else:
+            chosen, other, margin = self._best(self._candidates(points, num_points, registers))
+        if dense is not None and self.two_ways.learnt:
+            chosen, other, margin = self._decided(chosen, points, dense, registers, self.two_ways.surface)
+        elif dense is not None and self.two_ways.surface is not None:
+            chosen, other, margin = self._preferred(chosen, other, margin, points, dense, registers)
+        return chosen, other, margin, votes
 
     def _decided(
         self,
@@ -449,7 +471,7 @@ class PoseEstimator:
         with torch.autocast(points.device.type, enabled=False):
             if self.view_search.learnt:
                 found, _, margin, votes = self._seen(points)
-                shown = self._in_proportion(found, points)
+                shown = self._in_proportion(found, points, dense)
                 return self._packaged(shown, points, margin, votes), self._distance(found, points)
             if dense is not None and self.sliding.learnt:
                 found, _, margin, votes = self._slid(points, dense)
@@ -462,23 +484,28 @@ class PoseEstimator:
             found, _, margin = self._best(candidates)
             if dense is not None and self.two_ways.learnt:
                 found, _, margin = self._decided(found, points, dense, registers=True)
-            shown = self._in_proportion(found, points)
+            shown = self._in_proportion(found, points, dense)
             return self._packaged(shown, points, margin), self._distance(found, points)
 
     def _in_proportion(
         self,
         one: Hypotheses,  # H = 1
         points: Tensor,  # [B, N, 3]
+        dense: Tensor | None,  # [B, P, 3]
     ) -> Hypotheses:  # H = 1
-        """Explanations in the proportions of clouds (`fit_proportions`), where parts turn."""
+        """Explanations in the proportions of clouds (`fit_proportions`), turned as faces say, where parts turn."""
         joint_type = one.structure.joint_type
         if not self.inference.proportions or joint_type != REVOLUTE:
             return one
+        frames, known = self.part_frames, None
+        if dense is not None and frames.learnt:
+            one, known = frames.settled(one, dense)
         category = self.articulated.category.articulated_shape(joint_type)
         # Complete clouds, and scans that teach views, show where a hinge is.
         both = self.observation.bidirectional
         touching = both and self.observation.orientation.limited
-        return fit_proportions(one, category, points, self.inference.proportions, both, touching)
+        faces = None if known is None else frames.axes
+        return fit_proportions(one, category, points, self.inference.proportions, both, touching, faces, known)
 
     def _distance(
         self,

@@ -29,6 +29,8 @@ def fit_proportions(
     cycles: int,
     bidirectional: bool = True,
     touching: bool = False,
+    faces: Tensor | None = None,  # [K, 3, 3] columns
+    known: tuple[Tensor, Tensor] | None = None,  # [B], [B, J] bool
 ) -> Hypotheses:  # H = 1
     """The category's shape in the proportions of clouds, from where explanations of them are.
 
@@ -37,6 +39,9 @@ def fit_proportions(
 
     Args:
         touching: Both parts of a joint are drawn to its line (`InstanceFit.optimise`).
+        faces: Axes along which parts stretch instead of their principal ones, which of a body about as wide as high
+            are any; then it would shear.
+        known: Which clouds stay turned as they are, and which joint states stay.
     """
     # A test runs in inference mode, whose tensors no gradient goes through.
     with torch.inference_mode(False):
@@ -45,8 +50,10 @@ def fit_proportions(
         # Seen in the object's frame, a cloud that is turned is descended on alike.
         base = one.base[:, 0].clone()
         seen, still = transform_points(invert_se3(base), points.clone()), torch.eye(4).to(base).expand_as(base)
-        fit = InstanceFit(shape, still, one.state[:, 0].clone(), torch.Generator().manual_seed(0))
-        fit.optimise(seen, cycles, shared=False, bidirectional=bidirectional, touching=touching)
+        faces = None if faces is None else faces.clone()
+        fit = InstanceFit(shape, still, one.state[:, 0].clone(), torch.Generator().manual_seed(0), faces=faces)
+        known = None if known is None else tuple(value.clone() for value in known)
+        fit.optimise(seen, cycles, shared=False, bidirectional=bidirectional, touching=touching, known=known)
         instances = fit.instances()
         parts = torch.stack([instances.part(part) for part in range(shape.num_parts)], dim=1)
         center = parts.mean(dim=2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import torch
@@ -118,6 +119,24 @@ class Hypotheses:
         return ArticulatedShape(
             points, label, Joints(self.chain, self.axis.flatten(0, 1), pivot, self.structure.joint_type)
         )
+
+
+def concatenated(several: list[Hypotheses]) -> Hypotheses:
+    """Hypotheses of several batches as one; chain and joint type are those of the first."""
+
+    def joined(values: Iterable[Tensor]) -> Tensor:
+        return torch.cat(list(values))
+
+    first = several[0]
+    lines = {name: joined(getattr(one.structure, name) for one in several) for name in LINES}
+    return replace(
+        first,
+        shape=CanonicalShape(*map(joined, zip(*(one.shape for one in several), strict=True))),
+        structure=replace(first.structure, **lines),
+        base=joined(one.base for one in several),
+        state=joined(one.state for one in several),
+        association_logits=joined(one.association_logits for one in several),
+    )
 
 
 def either(

@@ -35,6 +35,7 @@ from articulate_ssl.ops.ranks import of_all_ranks
 from articulate_ssl.shape.observation import Observation
 from articulate_ssl.training.columns import TestColumns
 from articulate_ssl.training.explanations import learn_handedness, learn_two_ways
+from articulate_ssl.training.frame_lessons import learn_part_frames
 from articulate_ssl.training.hinge_lessons import learn_hinge_sides
 from articulate_ssl.training.hub import HubWeights
 from articulate_ssl.training.label_free_report import LabelFreeReport
@@ -83,6 +84,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             none.
         handedness_samples: Training clouds of an upright camera from which it is learnt whether some objects are mirror
             images of the others (`inference.handedness`); 0 learns nothing of it.
+        part_frames_samples: Training clouds from which it is learnt which parts have faces that say how they are
+            turned, where parts turn (`inference.part_frames`); 0 learns nothing of it.
         hinge_sides_samples: Training clouds in any orientation from which it is learnt whether some objects are hinged
             at another side than most (`inference.hinge_sides`); 0 learns nothing of it.
         orientation_range: How far objects are turned from their mean orientation at most, in degrees; 180 stands for
@@ -108,6 +111,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         calibration_samples: int = 128,
         two_ways_samples: int = 2000,
         handedness_samples: int = 256,
+        part_frames_samples: int = 256,
         hinge_sides_samples: int = 2000,
         orientation_range: float = 180.0,
     ) -> None:
@@ -126,7 +130,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         self.category, self.num_parts, self.schedule = category, num_parts, schedule
         self.inference, self.calibration_samples = inference, calibration_samples
         self.two_ways_samples, self.handedness_samples = two_ways_samples, handedness_samples
-        self.hinge_sides_samples = hinge_sides_samples
+        self.part_frames_samples, self.hinge_sides_samples = part_frames_samples, hinge_sides_samples
 
         self.articulated = ArticulatedNetwork(network, num_parts, JOINT_TYPES[joint_type], state_bound=state_range)
         self.rigid = RigidAlignment(network, num_parts * network.shape_points) if schedule.rigid_steps else None
@@ -138,6 +142,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         self.two_ways, self.sliding = self.estimator.two_ways, self.estimator.sliding
         self.view_search, self.handedness = self.estimator.view_search, self.estimator.handedness
         self.hinge_sides, self.states = self.estimator.hinge_sides, self.estimator.states
+        self.part_frames = self.estimator.part_frames
         self.recipe = recipe_type(self.estimator, objective, schedule, discovery)
         self.radius = RadiusStatistics()
         self.confidence = Confidence()
@@ -197,6 +202,9 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             learn_two_ways(self, self._training_clouds(self.two_ways_samples).to(self.device))
         if self.handedness_samples and self.orientation.limited:
             learn_handedness(self, self._training_clouds(self.handedness_samples).to(self.device))
+        turns = self.articulated.joint_type == REVOLUTE
+        if self.part_frames_samples and self.inference.refine and turns:
+            learn_part_frames(self, self._training_clouds(self.part_frames_samples).to(self.device))
         if self.hinge_sides_samples and self.inference.refine and not self.orientation.limited:
             learn_hinge_sides(self, self._training_clouds(self.hinge_sides_samples).to(self.device))
         clouds = self._training_clouds(self.calibration_samples).to(self.device)

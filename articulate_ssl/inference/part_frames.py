@@ -1,0 +1,325 @@
+"""How parts are turned, from the directions of their faces: most of an oven is square to itself, and so is its door.
+
+Registration turns a part to where its points fit best, and the category's shape fits an object of other proportions a
+few degrees off. Faces do not depend on proportions: the normals of a box, or of a plate, say to a fraction of a degree
+how it is turned, up to the 24 rotations of the cube, between which registration has decided. So of parts that have
+faces, the root is turned until it is square to them (a Manhattan frame, as of the whole cloud in
+`discovery.manhattan_frame`), and the joints of the others go to the states in which they are.
+
+Which parts have faces, and how these lie in canonical space, predictions of training clouds say, all together; and as
+two parts with faces are turned against each other about the joint between them, they say about which direction that is.
+No label is read.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import roma
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from articulate_ssl.geometry.se3 import se3
+from articulate_ssl.network.hypotheses import Hypotheses
+from articulate_ssl.ops.chamfer import nearest_distance
+
+_MEASURED = 256  # points of a part at which there are normals
+# Of the part, about each. A plate is thinner than so many of 4,096 points of an object are wide: its two faces are one.
+_NEIGHBOURS = 64
+# Least by largest but one variance of neighbours: beyond the first there is no face, and well below the second all
+# count alike.
+_CURVED, _FLAT = 0.3, 0.01
+_REACH = (20.0, 6.0)  # degrees: a normal farther from every axis does not count, in the first round and in the last
+_ROUNDS = 8
+_PRIOR = 0.02  # of what normals weigh, weighs how the part was turned: that decides what they leave open
+_FARTHEST = 20.0  # degrees that faces may turn a part by
+_FEWEST = 20  # faces that say how it is turned
+_LESSONS = 4  # rounds of squaring parts to their faces, and of seeing where these lie
+_TOGETHER, _SHARE = 12.0, 0.8  # a part has faces if in so many clouds they are so near, in degrees, to where most are
+_SQUARE, _MOST = 5.0, 10.0  # degrees: mean angle of normals to axes in the median cloud; each counts as at most so much
+# Of the faces of a box, so many are square to either axis but the first; a plate has nearly none. Boxes that were seen
+# have .16 and more, plates .01 and less.
+_BOX = 0.05
+_PARALLEL = 5.0  # degrees: a joint that is so near to an axis of the box that it is on is parallel to that
+
+
+class PartFrames(nn.Module):
+    """Of a category's parts, in canonical object space at joint states zero.
+
+    Attributes:
+        flat: [K] whether faces say how a part is turned; none until it is learnt.
+        axes: [K, 3, 3] columns, at right angles, that faces are square to; of all parts, so that parts stretch along
+            them.
+        measured: [J] whether it is known about which direction joints turn; elsewhere the network's word stays.
+        direction: [J, 3] unit, of those.
+    """
+
+    def __init__(self, num_parts: int) -> None:
+        """Args: K."""
+        super().__init__()
+        self.register_buffer("flat", torch.zeros(num_parts, dtype=torch.bool))
+        self.register_buffer("axes", torch.eye(3).repeat(num_parts, 1, 1))
+        self.register_buffer("measured", torch.zeros(num_parts - 1, dtype=torch.bool))
+        self.register_buffer("direction", torch.zeros(num_parts - 1, 3))
+
+    def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
+        for name, value in self.named_buffers(recurse=False):  # weights from before there were any
+            state_dict.setdefault(prefix + name, value.clone())
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+    @property
+    def learnt(self) -> bool:
+        """Whether faces say anything."""
+        return bool(self.flat.any())
+
+    def learn(
+        self,
+        one: Hypotheses,  # H = 1, of n clouds, whose joints turn
+        faces: Faces,
+        start: Tensor,  # [K, 3, 3] columns, right-handed: roughly the axes
+    ) -> Tensor:  # [K, 2]
+        """Find out which parts have faces, how these lie, and about which directions joints turn.
+
+        Where the root has none, nothing is learnt: about a line that is a few degrees off, faces turn other parts to
+        wrong states.
+
+        Returns:
+            Of every part the share of clouds in which its faces lie where most do, and how square they are (degrees).
+        """
+        chain = one.chain
+        found = [self._lie(one, part, faces.of(part), start[part]) for part in range(chain.num_parts)]
+        quality = torch.stack([torch.stack(some) for _, *some in found])
+        flat = (quality[:, 0] > _SHARE) & (quality[:, 1] < _SQUARE)
+        self.flat.copy_(flat & flat[chain.root])
+        self.measured.fill_(False)
+        for joint, (parent, child) in enumerate(zip(chain.parent, chain.child, strict=True)):
+            body, part = faces.of(parent), faces.of(child)
+            if not self.flat[parent] or body.along(found[parent][0]).mean(dim=0).median() < _BOX:
+                continue
+            direction = functional.normalize(one.axis[:, 0, joint].mean(dim=0), dim=0)
+            if self.flat[child]:
+                seen = self.axes[parent] @ found[parent][0].mT @ found[child][0]
+                known = body.enough & part.enough
+                direction = _common_axis(seen[known], part.along(found[child][0])[known], direction)
+            cosine = self.axes[parent].T @ direction
+            nearest = cosine.abs().argmax()
+            if cosine[nearest].abs() > math.cos(math.radians(_PARALLEL)):
+                direction = self.axes[parent][:, nearest] * cosine[nearest].sign()
+            self.direction[joint], self.measured[joint] = direction, True
+        return quality
+
+    def settled(
+        self,
+        one: Hypotheses,  # H = 1
+        dense: Tensor,  # [B, P, 3]
+    ) -> tuple[Hypotheses, tuple[Tensor, Tensor]]:  # H = 1, ([B], [B, J])
+        """Explanations turned as the faces of clouds say, and whether they do: of the whole, and of every joint."""
+        axis = torch.where(self.measured[:, None], self.direction, one.axis)
+        one = replace(one, structure=replace(one.structure, axis=axis))
+        one, turned = self._root_squared(one, faces_of(one, dense).of(one.chain.root))
+        one, moved = self._joints_squared(one, faces_of(one, dense))
+        return one, (turned, moved)
+
+    def _lie(
+        self, one: Hypotheses, part: int, faces: Faces, axes: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:  # [n, 3, 3], [], []
+        """See `learn`, of one part: how clouds' own axes are turned, in camera space, the share, and how square."""
+        pose, root = one.object_pose()[:, 0, part, :3, :3], part == one.chain.root
+        joint = 0 if root else one.chain.child.index(part)
+        line = one.axis[:, 0, joint]
+        for _ in range(_LESSONS):
+            frame = pose @ axes
+            if not root:
+                by = _squared_about((pose @ line[..., None]).squeeze(-1), frame, faces)
+                frame = pose @ roma.rotvec_to_rotmat(line * by[:, None]) @ axes
+            frame, angle = square_to(frame, faces)
+            if root:
+                axes, near = _where_most_are(pose.mT @ frame, faces.enough)
+            else:  # in its own plane a plate is not known to lie: only how it is turned about its joint counts
+                middle, near = _where_most_turn(by, faces.enough)
+                axes = roma.rotvec_to_rotmat(functional.normalize(line.mean(dim=0), dim=0) * middle) @ axes
+        self.axes[part] = axes
+        if not faces.enough.any():
+            return frame, angle.new_zeros(()), angle.new_tensor(_MOST)
+        return frame, near[faces.enough].float().mean(), angle[faces.enough].median()
+
+    def _root_squared(
+        self,
+        one: Hypotheses,  # H = 1
+        faces: Faces,  # of the root
+    ) -> tuple[Hypotheses, Tensor]:  # H = 1, [B]
+        """Explanations turned about the middle of their root until it is square to its faces, and which were."""
+        root, old = one.chain.root, one.base[:, 0, :3, :3]
+        new = square_to(old @ self.axes[root], faces)[0] @ self.axes[root].mT
+        turned = faces.enough & (roma.rotmat_geodesic_distance(new, old) < math.radians(_FARTHEST))
+        new = torch.where(turned[:, None, None], new, old)
+        middle = one.object_shape()[:, root].mean(dim=1, keepdim=True)
+        place = one.base[:, 0, :3, 3] + (middle @ (old - new).mT).squeeze(1)
+        return one.at(se3(new, place)[:, None], one.state), turned
+
+    def _joints_squared(
+        self,
+        one: Hypotheses,  # H = 1
+        faces: Faces,
+    ) -> tuple[Hypotheses, Tensor]:  # H = 1, [B, J]
+        """Explanations with joints in the states in which parts are square to their faces, and which were."""
+        moved = torch.zeros_like(one.state[:, 0], dtype=torch.bool)
+        for joint, part in enumerate(one.chain.child):
+            if not self.flat[part]:
+                continue
+            pose, own = one.object_pose()[:, 0, part, :3, :3], faces.of(part)
+            angle = _squared_about((pose @ one.axis[:, 0, joint, :, None]).squeeze(-1), pose @ self.axes[part], own)
+            moved[:, joint] = own.enough & (angle.abs() < math.radians(_FARTHEST))
+            state = one.state.clone()
+            state[:, 0, joint] += torch.where(moved[:, joint], angle, 0)
+            one = one.at(one.base, state)
+        return one, moved
+
+
+class Faces:
+    """Normals of B clouds, and how much each counts, by part.
+
+    Attributes:
+        normal: [B, K, m, 3] unit, up to sign; of one part [B, m, 3].
+        weight: [B, K, m]; likewise.
+    """
+
+    def __init__(self, normal: Tensor, weight: Tensor) -> None:
+        self.normal, self.weight = normal, weight
+
+    def of(self, part: int) -> Faces:
+        """Those of one part."""
+        return Faces(self.normal[:, part], self.weight[:, part])
+
+    @property
+    def enough(self) -> Tensor:
+        """[B] whether there are enough to tell how one part is turned."""
+        return (self.weight > 0).sum(dim=1) >= _FEWEST
+
+    def along(
+        self,
+        frame: Tensor,  # [B, 3, 3] columns
+    ) -> Tensor:  # [B, 3]
+        """Shares of those that are square to each axis, of all that are square to any."""
+        to_axis = _nearest_axis(frame, self.normal, torch.tensor(_REACH[1]).deg2rad())
+        count = torch.einsum("bm,bmi->bi", self.weight, to_axis.abs())
+        return count / count.sum(dim=1, keepdim=True).clamp(min=1e-6)
+
+
+def faces_of(
+    one: Hypotheses,  # H = 1
+    dense: Tensor,  # [B, P, 3]
+) -> Faces:
+    """Normals of clouds, by the part of their explanations that is nearest."""
+    posed = one.posed()[:, 0]
+    nearest = torch.stack([nearest_distance(dense, posed[:, k]) for k in range(posed.shape[1])]).argmin(dim=0)
+    found = [
+        [_normals(cloud[part == k]) for k in range(posed.shape[1])] for cloud, part in zip(dense, nearest, strict=True)
+    ]
+    normal, weight = (
+        torch.stack([torch.stack(parts) for parts in some])
+        for some in zip(*([*zip(*parts, strict=True)] for parts in found), strict=True)
+    )
+    return Faces(normal, weight)
+
+
+def square_to(
+    frame: Tensor,  # [B, 3, 3] columns
+    faces: Faces,
+) -> tuple[Tensor, Tensor]:  # [B, 3, 3], [B]
+    """Frames turned until normals are along their axes, and the mean angle (degrees, capped) of those to them.
+
+    As in `manhattan_frames`, but near where they are: every normal pulls the axis that is nearest, if one is near.
+    """
+    start, weight = frame, faces.weight[..., None]
+    prior = _PRIOR * faces.weight.sum(dim=1)[:, None, None] + 1e-6
+    for reach in torch.linspace(*_REACH, _ROUNDS).deg2rad():
+        to_axis = _nearest_axis(frame, faces.normal, reach)
+        frame = roma.special_procrustes(torch.einsum("bmi,bmj->bij", weight * faces.normal, to_axis) + prior * start)
+    cosine = torch.einsum("bij,bmi->bmj", frame, faces.normal).abs().amax(dim=-1).clamp(max=1)
+    angle = cosine.acos().rad2deg().clamp(max=_MOST)
+    return frame, (faces.weight * angle).sum(dim=1) / faces.weight.sum(dim=1).clamp(min=1e-6)
+
+
+def _squared_about(
+    axis: Tensor,  # [B, 3] unit
+    frame: Tensor,  # [B, 3, 3] columns
+    faces: Faces,
+) -> Tensor:  # [B] radians
+    """By how much frames are turned about an axis until normals are along theirs (`square_to`)."""
+    total = torch.zeros_like(axis[:, 0])
+    along = (faces.normal @ axis[..., None]).squeeze(-1)
+    for reach in torch.linspace(*_REACH, _ROUNDS).deg2rad():
+        turned = roma.rotvec_to_rotmat(axis * total[:, None]) @ frame
+        target = torch.einsum("bij,bmj->bmi", turned, _nearest_axis(turned, faces.normal, reach))
+        sine = (torch.linalg.cross(target, faces.normal) @ axis[..., None]).squeeze(-1)
+        cosine = (target * faces.normal).sum(dim=-1) - along * (target @ axis[..., None]).squeeze(-1)
+        total = total + torch.atan2((faces.weight * sine).sum(dim=1), (faces.weight * cosine).sum(dim=1) + 1e-6)
+    return total
+
+
+def _nearest_axis(frame: Tensor, normal: Tensor, reach: Tensor) -> Tensor:
+    """In frames [B, 3, 3], the axes [B, m, 3] that normals [B, m, 3] are along but for the sign; 0 if none is near."""
+    seen = torch.einsum("bij,bmi->bmj", frame, normal)
+    largest = seen.abs().amax(dim=-1, keepdim=True)
+    return seen.sign() * (seen.abs() == largest) * (largest > reach.cos())
+
+
+def _normals(points: Tensor) -> tuple[Tensor, Tensor]:
+    """Of a part [p, 3] the normals of its surface at some points [m, 3], and how much they count [m]."""
+    normal, weight = points.new_zeros(_MEASURED, 3), points.new_zeros(_MEASURED)
+    count = min(_NEIGHBOURS, len(points) // 2)
+    if count < _FEWEST:
+        return normal, weight
+    at = torch.linspace(0, len(points) - 1, min(_MEASURED, len(points))).long().to(points.device)
+    patch = points[torch.cdist(points[at], points).topk(count, largest=False).indices]
+    offset = patch - patch.mean(dim=1, keepdim=True)
+    variance, directions = torch.linalg.eigh(offset.mT @ offset)
+    thickness = variance[:, 0].clamp(min=0) / variance[:, 1].clamp(min=1e-12)
+    normal[: len(at)] = directions[..., 0]
+    weight[: len(at)] = (thickness < _CURVED) / (thickness + _FLAT)
+    return normal, weight
+
+
+def _where_most_are(
+    frames: Tensor,  # [n, 3, 3]
+    known: Tensor,  # [n] bool
+) -> tuple[Tensor, Tensor]:  # [3, 3], [n]
+    """The mean of the frames that most are near to, and which these are."""
+    distance = roma.rotmat_geodesic_distance(frames[:, None], frames).rad2deg()
+    middle = (distance.clamp(max=_TOGETHER) * known).sum(dim=1).argmin()
+    near = known & (distance[middle] < _TOGETHER)
+    return roma.special_procrustes(frames[near].sum(dim=0) + 1e-6 * frames[middle]), near
+
+
+def _where_most_turn(
+    angle: Tensor,  # [n] radians
+    known: Tensor,  # [n] bool
+) -> tuple[Tensor, Tensor]:  # [], [n]
+    """The mean of the angles that most are near to, and which these are."""
+    apart, reach = (angle[:, None] - angle).abs(), math.radians(_TOGETHER)
+    middle = (apart.clamp(max=reach) * known).sum(dim=1).argmin()
+    near = known & (apart[middle] < reach)
+    return angle[near].mean() if near.any() else angle[middle], near
+
+
+def _common_axis(
+    turned: Tensor,  # [n, 3, 3] columns, as they turn about one direction
+    share: Tensor,  # [n, 3] of what says where these are
+    start: Tensor,  # [3]
+) -> Tensor:  # [3] unit
+    """The direction: columns that turn about it stay at the same angle to it.
+
+    Of a plate its normal is known, and how it lies in its own plane is not, so columns count as faces are square to
+    them. Clouds in which they do not stay count less, as a Cauchy loss has it.
+    """
+    axis, column, trust = start, turned.mT, turned.new_ones(len(turned))
+    for _ in range(_ROUNDS):
+        weight = (trust[:, None] * share)[..., None]  # [n, 3, 1]
+        off = column - (weight * column).sum(dim=0) / weight.sum(dim=0).clamp(min=1e-6)
+        least = torch.linalg.eigh(torch.einsum("nci,ncj->ij", weight * off, off)).eigenvectors[:, 0]
+        axis = least * (least @ axis).sign()
+        trust = 1 / ((share * (off @ axis).square()).sum(dim=1) + math.radians(1) ** 2)
+    return axis

@@ -1,0 +1,58 @@
+"""What `inference.part_frames` is learnt from: how faces of parts lie in predictions of training clouds."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+from trimesh.bounds import oriented_bounds
+
+from articulate_ssl.inference.part_frames import Faces, faces_of
+from articulate_ssl.network.hypotheses import concatenated
+from articulate_ssl.ops.progress import announced
+from articulate_ssl.shape.articulated_shape import ArticulatedShape
+from articulate_ssl.shape.object_axes import object_axes
+from articulate_ssl.training.explanations import registered_points
+
+if TYPE_CHECKING:
+    from articulate_ssl.training.module import ArticulatedPoseModule
+
+_BATCH = 16
+
+log = logging.getLogger(__name__)
+
+
+@torch.no_grad()
+def learn_part_frames(
+    module: ArticulatedPoseModule,
+    clouds: Tensor,  # [n, N, 3] farthest-point order, dense
+) -> None:
+    """Find out which parts have faces that say how they are turned."""
+    estimator, count = module.estimator, registered_points(module)
+    frames = estimator.part_frames
+    frames.flat.fill_(False)
+    found, faces = [], []
+    for some in announced(log, "faces of parts", clouds.split(_BATCH)):
+        found.append(estimator.explained(some[:, :count], module.num_points, some))
+        faces.append(faces_of(found[-1], some))
+    every = Faces(*(torch.cat([getattr(some, name) for some in faces]) for name in ("normal", "weight")))
+    network = module.articulated
+    start = rough_axes(network.category.articulated_shape(network.joint_type))
+    quality = frames.learn(concatenated(found), every, start)
+    for part, (share, angle) in enumerate(quality.tolist()):
+        flat = "has" if frames.flat[part] else "has no"
+        log.info("part %d %s faces: %.0f %% of clouds alike, %.1f degrees", part, flat, 100 * share, angle)
+
+
+def rough_axes(shape: ArticulatedShape) -> Tensor:  # [K, 3, 3] columns
+    """Of the smallest box about the root, and of those about other parts that have their hinge for an edge."""
+    chain, axes = shape.joints.chain, [None] * shape.num_parts
+    box = oriented_bounds(shape.part(chain.root).double().cpu().numpy(), angle_digits=2)[0]
+    axes[chain.root] = torch.from_numpy(box[:3, :3].T.copy()).to(shape.points)
+    for joint, part in enumerate(chain.child):
+        line = replace(shape.joints, axis=shape.joints.axis[joint, None], chain=replace(chain, root=part))
+        axes[part] = object_axes(replace(shape, joints=line))
+    return torch.stack([some * torch.linalg.det(some).sign() for some in axes])
