@@ -26,8 +26,9 @@ from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.ops.chamfer import nearest_distance
 
 _MEASURED = 256  # points of a part at which there are normals
-# Of the part, about each. A plate is thinner than so many of 4,096 points of an object are wide: its two faces are one.
-_NEIGHBOURS = 64
+# Standard deviation, in normalised units, of the window that looks at the part's surface about each. Plates are
+# thinner than that is wide: their two faces are one.
+_WINDOW = 0.05
 # Least by largest but one variance of neighbours: beyond the first there is no face, and well below the second all
 # count alike.
 _CURVED, _FLAT = 0.3, 0.01
@@ -270,13 +271,13 @@ def _nearest_axis(frame: Tensor, normal: Tensor, reach: Tensor) -> Tensor:
 def _normals(points: Tensor) -> tuple[Tensor, Tensor]:
     """Of a part [p, 3] the normals of its surface at some points [m, 3], and how much they count [m]."""
     normal, weight = points.new_zeros(_MEASURED, 3), points.new_zeros(_MEASURED)
-    count = min(_NEIGHBOURS, len(points) // 2)
-    if count < _FEWEST:
+    if len(points) < 2 * _FEWEST:
         return normal, weight
     at = torch.linspace(0, len(points) - 1, min(_MEASURED, len(points))).long().to(points.device)
-    patch = points[torch.cdist(points[at], points).topk(count, largest=False).indices]
-    offset = patch - patch.mean(dim=1, keepdim=True)
-    variance, directions = torch.linalg.eigh(offset.mT @ offset)
+    seen = (torch.cdist(points[at], points).square() / (-2 * _WINDOW**2)).exp()
+    seen = seen / seen.sum(dim=1, keepdim=True)
+    mean, square = seen @ points, seen @ (points[:, :, None] * points[:, None]).flatten(1)
+    variance, directions = torch.linalg.eigh(square.unflatten(1, (3, 3)) - mean[:, :, None] * mean[:, None])
     thickness = variance[:, 0].clamp(min=0) / variance[:, 1].clamp(min=1e-12)
     normal[: len(at)] = directions[..., 0]
     weight[: len(at)] = (thickness < _CURVED) / (thickness + _FLAT)
