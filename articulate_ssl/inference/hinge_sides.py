@@ -30,6 +30,7 @@ from articulate_ssl.discovery.manhattan_frame import manhattan_frames
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.screw import REVOLUTE, screw_motion
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
+from articulate_ssl.inference.part_frames import PartFrames
 from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.inference.surface_decision import LOOKS, SIZE, WithSurface
 from articulate_ssl.network.surface_network import SurfaceCloud, SurfaceSize
@@ -101,14 +102,19 @@ class HingeSides(WithSurface):
         """By how many quarters the ways are turned."""
         return torch.arange(0, TURNS, 2 if self.whole else 1, device=self.closed.device)
 
-    def measure(self, shape: ArticulatedShape, state_range: Tensor) -> None:
+    def measure(self, shape: ArticulatedShape, state_range: Tensor, frames: PartFrames | None = None) -> None:
         """Find axes and the closed door of a category's shape with one joint.
 
         Args:
             state_range: [1, 2] joint states that were seen.
+            frames: How the faces of its parts lie; where that is known, they are squarer than boxes about points.
         """
         root, child = shape.joints.chain.root, shape.joints.chain.child[0]
-        axes, own = object_axes(shape), _box_axes(shape, child)
+        if frames is not None and frames.flat.all() and frames.measured.all():
+            shape = replace(shape, joints=replace(shape.joints, axis=frames.direction))
+            axes, own = frames.about_joint(root), frames.about_joint(child)
+        else:
+            axes, own = object_axes(shape), _box_axes(shape, child)
         hinge, one, other = axes[:, 0], own[:, 1], axes[:, 1]
         # A closed door is square to its body, and the whole is small.
         square = math.atan2(float(torch.linalg.cross(one, other) @ hinge), float(one @ other))

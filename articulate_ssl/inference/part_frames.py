@@ -111,6 +111,17 @@ class PartFrames(nn.Module):
             self.direction[joint], self.measured[joint] = direction, True
         return quality
 
+    def about_joint(self, part: int) -> Tensor:  # [3, 3] columns
+        """A part's axes, that which is nearest to the direction of the first joint turned to it, and first."""
+        axes, first = self.axes[part], self.direction[0]
+        cosine = axes.T @ first
+        nearest = int(cosine.abs().argmax())
+        axis = axes[:, nearest] * cosine[nearest].sign()
+        turn = torch.linalg.cross(axis, first)
+        turn = turn / turn.norm().clamp(min=1e-9) * torch.atan2(turn.norm(), axis @ first)
+        others = roma.rotvec_to_rotmat(turn) @ axes[:, [k for k in range(3) if k != nearest]]
+        return torch.cat([first[:, None], others], dim=1)
+
     def settled(
         self,
         one: Hypotheses,  # H = 1

@@ -52,7 +52,8 @@ def learn_hinge_sides(
     sides.surface = None
     if network.num_parts != 2 or network.joint_type != REVOLUTE or TAUGHT * len(clouds) < FEWEST:
         return
-    sides.measure(network.category.articulated_shape(network.joint_type), module.states.limits)
+    shape = network.category.articulated_shape(network.joint_type)
+    sides.measure(shape, module.states.limits, module.estimator.part_frames)
     predictions = _predictions(module, clouds[:_FIRST])
     if _bodies(module, clouds[:_FIRST], predictions).known.double().mean() < _KNOWN:
         log.info("hinge sides: too little is seen behind the closed door")

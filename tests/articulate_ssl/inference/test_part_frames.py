@@ -19,7 +19,7 @@ from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.training import frame_lessons
 from articulate_ssl.training.frame_lessons import learn_part_frames, rough_axes
 
-DENSE = 1200  # half of them on the door: as dense as scans of 4,096 points are there
+DENSE = 2400
 TILT = roma.rotvec_to_rotmat(math.radians(5) * torch.tensor([0.6, 0.0, 0.8]))  # of the joint that is believed
 TURNED, MOVED = 4.0, 8.0  # degrees by which explanations are off, at most
 
