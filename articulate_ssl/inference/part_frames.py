@@ -14,6 +14,7 @@ No label is read.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import roma
@@ -27,8 +28,8 @@ from articulate_ssl.ops.chamfer import nearest_distance
 
 _MEASURED = 256  # points of a part at which there are normals
 # Standard deviation, in normalised units, of the window that looks at the part's surface about each. Plates are
-# thinner than that is wide: their two faces are one.
-_WINDOW = 0.05
+# thinner than that is wide: their two faces are one. Of a door that bulges, the wider one sees the whole.
+WINDOWS = (0.05, 0.2)
 # Least by largest but one variance of neighbours: beyond the first there is no face, and well below the second all
 # count alike.
 _CURVED, _FLAT = 0.3, 0.01
@@ -51,6 +52,7 @@ class PartFrames(nn.Module):
 
     Attributes:
         flat: [K] whether faces say how a part is turned; none until it is learnt.
+        wide: [K] whether they do in the wider window alone.
         axes: [K, 3, 3] columns, at right angles, that faces are square to; of all parts, so that parts stretch along
             them.
         measured: [J] whether it is known about which direction joints turn; elsewhere the network's word stays.
@@ -61,6 +63,7 @@ class PartFrames(nn.Module):
         """Args: K."""
         super().__init__()
         self.register_buffer("flat", torch.zeros(num_parts, dtype=torch.bool))
+        self.register_buffer("wide", torch.zeros(num_parts, dtype=torch.bool))
         self.register_buffer("axes", torch.eye(3).repeat(num_parts, 1, 1))
         self.register_buffer("measured", torch.zeros(num_parts - 1, dtype=torch.bool))
         self.register_buffer("direction", torch.zeros(num_parts - 1, 3))
@@ -78,38 +81,47 @@ class PartFrames(nn.Module):
     def learn(
         self,
         one: Hypotheses,  # H = 1, of n clouds, whose joints turn
-        faces: Faces,
+        windows: tuple[Faces, Faces],  # as seen in either window
         start: Tensor,  # [K, 3, 3] columns, right-handed: roughly the axes
     ) -> Tensor:  # [K, 2]
         """Find out which parts have faces, how these lie, and about which directions joints turn.
 
         Where the root has none, nothing is learnt: about a line that is a few degrees off, faces turn other parts to
-        wrong states.
+        wrong states. Other parts that have none in the narrow window may have one in the wide one.
 
         Returns:
             Of every part the share of clouds in which its faces lie where most do, and how square they are (degrees).
         """
         chain = one.chain
-        found = [self._lie(one, part, faces.of(part), start[part]) for part in range(chain.num_parts)]
-        quality = torch.stack([torch.stack(some) for _, *some in found])
-        flat = (quality[:, 0] > _SHARE) & (quality[:, 1] < _SQUARE)
-        self.flat.copy_(flat & flat[chain.root])
+        flat, found, quality, faces = [], [], [], windows[0]
+        for part in range(chain.num_parts):
+            for wide in (False, True) if part != chain.root else (False,):
+                frame, *some = self._lie(one, part, windows[wide].of(part), start[part])
+                clear = bool(some[0] > _SHARE and some[1] < _SQUARE)
+                self.wide[part] = wide and clear
+                if clear:
+                    break
+            flat.append(clear)
+            found.append(frame)
+            quality.append(torch.stack(some))
+            faces = faces.with_part(part, windows[int(self.wide[part])])
+        self.flat.copy_(torch.tensor(flat) & flat[chain.root])
         self.measured.fill_(False)
         for joint, (parent, child) in enumerate(zip(chain.parent, chain.child, strict=True)):
             body, part = faces.of(parent), faces.of(child)
-            if not self.flat[parent] or body.along(found[parent][0]).mean(dim=0).median() < _BOX:
+            if not self.flat[parent] or body.along(found[parent]).mean(dim=0).median() < _BOX:
                 continue
             direction = functional.normalize(one.axis[:, 0, joint].mean(dim=0), dim=0)
             if self.flat[child]:
-                seen = self.axes[parent] @ found[parent][0].mT @ found[child][0]
+                seen = self.axes[parent] @ found[parent].mT @ found[child]
                 known = body.enough & part.enough
-                direction = _common_axis(seen[known], part.along(found[child][0])[known], direction)
+                direction = _common_axis(seen[known], part.along(found[child])[known], direction)
             cosine = self.axes[parent].T @ direction
             nearest = cosine.abs().argmax()
             if cosine[nearest].abs() > math.cos(math.radians(_PARALLEL)):
                 direction = self.axes[parent][:, nearest] * cosine[nearest].sign()
             self.direction[joint], self.measured[joint] = direction, True
-        return quality
+        return torch.stack(quality)
 
     def about_joint(self, part: int) -> Tensor:  # [3, 3] columns
         """A part's axes, that which is nearest to the direction of the first joint turned to it, and first."""
@@ -130,8 +142,9 @@ class PartFrames(nn.Module):
         """Explanations turned as the faces of clouds say, and whether they do: of the whole, and of every joint."""
         axis = torch.where(self.measured[:, None], self.direction, one.axis)
         one = replace(one, structure=replace(one.structure, axis=axis))
-        one, turned = self._root_squared(one, faces_of(one, dense).of(one.chain.root))
-        one, moved = self._joints_squared(one, faces_of(one, dense))
+        windows = [WINDOWS[int(wide)] for wide in self.wide]
+        one, turned = self._root_squared(one, faces_of(one, dense, windows).of(one.chain.root))
+        one, moved = self._joints_squared(one, faces_of(one, dense, windows))
         return one, (turned, moved)
 
     def _lie(
@@ -205,6 +218,12 @@ class Faces:
         """Those of one part."""
         return Faces(self.normal[:, part], self.weight[:, part])
 
+    def with_part(self, part: int, other: Faces) -> Faces:
+        """The same, of one part as others have them."""
+        normal, weight = self.normal.clone(), self.weight.clone()
+        normal[:, part], weight[:, part] = other.normal[:, part], other.weight[:, part]
+        return Faces(normal, weight)
+
     @property
     def enough(self) -> Tensor:
         """[B] whether there are enough to tell how one part is turned."""
@@ -223,12 +242,14 @@ class Faces:
 def faces_of(
     one: Hypotheses,  # H = 1
     dense: Tensor,  # [B, P, 3]
+    windows: Sequence[float],  # of every part
 ) -> Faces:
     """Normals of clouds, by the part of their explanations that is nearest."""
     posed = one.posed()[:, 0]
     nearest = torch.stack([nearest_distance(dense, posed[:, k]) for k in range(posed.shape[1])]).argmin(dim=0)
     found = [
-        [_normals(cloud[part == k]) for k in range(posed.shape[1])] for cloud, part in zip(dense, nearest, strict=True)
+        [_normals(cloud[part == k], window) for k, window in enumerate(windows)]
+        for cloud, part in zip(dense, nearest, strict=True)
     ]
     normal, weight = (
         torch.stack([torch.stack(parts) for parts in some])
@@ -279,13 +300,13 @@ def _nearest_axis(frame: Tensor, normal: Tensor, reach: Tensor) -> Tensor:
     return seen.sign() * (seen.abs() == largest) * (largest > reach.cos())
 
 
-def _normals(points: Tensor) -> tuple[Tensor, Tensor]:
+def _normals(points: Tensor, window: float) -> tuple[Tensor, Tensor]:
     """Of a part [p, 3] the normals of its surface at some points [m, 3], and how much they count [m]."""
     normal, weight = points.new_zeros(_MEASURED, 3), points.new_zeros(_MEASURED)
     if len(points) < 2 * _FEWEST:
         return normal, weight
     at = torch.linspace(0, len(points) - 1, min(_MEASURED, len(points))).long().to(points.device)
-    seen = (torch.cdist(points[at], points).square() / (-2 * _WINDOW**2)).exp()
+    seen = (torch.cdist(points[at], points).square() / (-2 * window**2)).exp()
     seen = seen / seen.sum(dim=1, keepdim=True)
     mean, square = seen @ points, seen @ (points[:, :, None] * points[:, None]).flatten(1)
     variance, directions = torch.linalg.eigh(square.unflatten(1, (3, 3)) - mean[:, :, None] * mean[:, None])

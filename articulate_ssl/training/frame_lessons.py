@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from trimesh.bounds import oriented_bounds
 
-from articulate_ssl.inference.part_frames import Faces, faces_of
+from articulate_ssl.inference.part_frames import WINDOWS, Faces, faces_of
 from articulate_ssl.network.hypotheses import concatenated
 from articulate_ssl.ops.progress import announced
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
@@ -37,8 +37,11 @@ def learn_part_frames(
     found, faces = [], []
     for some in announced(log, "faces of parts", clouds.split(_BATCH)):
         found.append(estimator.explained(some[:, :count], module.num_points, some))
-        faces.append(faces_of(found[-1], some))
-    every = Faces(*(torch.cat([getattr(some, name) for some in faces]) for name in ("normal", "weight")))
+        faces.append([faces_of(found[-1], some, [window] * module.num_parts) for window in WINDOWS])
+    every = tuple(
+        Faces(torch.cat([some.normal for some in seen]), torch.cat([some.weight for some in seen]))
+        for seen in zip(*faces, strict=True)
+    )
     network = module.articulated
     start = rough_axes(network.category.articulated_shape(network.joint_type))
     quality = frames.learn(concatenated(found), every, start)

@@ -9,10 +9,11 @@ import torch
 from articulated_objects import LAPTOP, OVEN, Clouds, clouds, true_shape
 from tiny import POINTS, tiny_module
 
+from articulate_ssl.geometry.screw import screw_motion
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
 from articulate_ssl.inference import part_frames
 from articulate_ssl.inference.options import InferenceOptions
-from articulate_ssl.inference.part_frames import PartFrames, faces_of, square_to
+from articulate_ssl.inference.part_frames import WINDOWS, Faces, PartFrames, faces_of, square_to
 from articulate_ssl.network.heads.shape import CanonicalShape
 from articulate_ssl.network.heads.structure import Structure
 from articulate_ssl.network.hypotheses import Hypotheses
@@ -52,7 +53,11 @@ def _learnt(design, data: Clouds) -> tuple[PartFrames, torch.Tensor]:
     one = _explained(design, data)
     frames, shape = PartFrames(one.chain.num_parts), true_shape(design, data)
     believed = replace(shape, joints=replace(shape.joints, axis=shape.joints.axis @ TILT.mT))
-    return frames, frames.learn(one, faces_of(one, data.points), rough_axes(believed))
+    return frames, frames.learn(one, _windows(one, data), rough_axes(believed))
+
+
+def _windows(one: Hypotheses, data: Clouds) -> tuple[Faces, Faces]:
+    return tuple(faces_of(one, data.points, [window] * one.chain.num_parts) for window in WINDOWS)
 
 
 def _degrees(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
@@ -151,6 +156,23 @@ def test_plates_say_how_they_are_turned_and_not_about_what():
     assert frames.measured.tolist() == [False]
 
 
+def test_a_door_that_bulges_is_a_plate_as_a_whole():
+    """Its normals point everywhere; in the wide window all of them are one."""
+    data = _data()
+    door = data.part == 1
+    away = (data.rest[door][:, 1:] - torch.tensor([0.3, 0.225])).norm(dim=-1)
+    bulge = torch.zeros_like(data.rest)
+    bulge[door, 0] = 0.12 * (1 - away / 0.3).clamp(min=0).sqrt() - 0.04 * (away * 40).sin()
+    turn = torch.stack([screw_motion(data.axis[0], data.pivot[0], state, 0) for state in data.state[:, 0]])
+    pose = (data.base @ turn)[:, :3, :3]
+    moved = data._replace(points=data.points + bulge @ pose.mT, rest=data.rest + bulge)
+    frames, _ = _learnt(OVEN, moved)
+    assert frames.flat.tolist() == [True, True]
+    assert frames.wide.tolist() == [False, True]
+    after, _ = frames.settled(_explained(OVEN, moved, seed=8), moved.points)
+    assert (after.state[:, 0] - data.state).rad2deg().abs().median() < 3
+
+
 def test_balls_have_no_faces():
     """Where the root is round nothing is learnt, though the door has faces."""
     data = _data()
@@ -192,7 +214,7 @@ def test_few_points_turn_nothing(oven):
 def test_a_frame_is_squared_where_normals_leave_nothing_open(oven):
     data = _data(count=5, seed=4)
     one = _explained(OVEN, data)
-    faces = faces_of(one, data.points).of(0)
+    faces = _windows(one, data)[0].of(0)
     frame, angle = square_to(one.base[:, 0, :3, :3] @ oven[0].axes[0], faces)
     inward = data.base[:, :3, :3].mT @ frame
     assert (_degrees(inward, inward.round()) < 1).all()
@@ -224,7 +246,7 @@ def test_weights_from_before_know_no_faces():
     module = tiny_module()
     module.load_state_dict(state)
     assert not module.part_frames.learnt
-    assert set(frames.state_dict()) == {"flat", "axes", "measured", "direction"}
+    assert set(frames.state_dict()) == {"flat", "wide", "axes", "measured", "direction"}
 
 
 def test_a_module_learns_from_what_it_predicts(monkeypatch):
