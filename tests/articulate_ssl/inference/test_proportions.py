@@ -159,7 +159,7 @@ def test_parts_are_drawn_to_a_hinge_that_floats(monkeypatch):
     assert apart(drawn).max() < 0.055
     # Parts of complete clouds are not.
     seen = []
-    monkeypatch.setattr(pose_estimation, "fit_proportions", lambda *args: seen.append(args[-2:]) or args[0])
+    monkeypatch.setattr(pose_estimation, "fit_proportions", lambda *args: seen.append(args[4:6]) or args[0])
     for views, unidirectional in ((60.0, False), (180.0, False), (60.0, True)):
         module = tiny_module(orientation_range=views).eval()
         module.estimator.observation = Observation(OrientationRange(views), unidirectional)
