@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from articulate_ssl.training.module import ArticulatedPoseModule
 
 _BATCH = 16
+_THICKNESS = 1e-4  # in normalised units
 
 log = logging.getLogger(__name__)
 
@@ -52,6 +53,9 @@ def learn_part_frames(
 
 def rough_axes(shape: ArticulatedShape) -> Tensor:  # [K, 3, 3] columns
     """Of the smallest box about the root, and of those about other parts that have their hinge for an edge."""
+    # About a sheet without thickness, or what has collapsed to less, there is no smallest box.
+    noise = torch.randn(shape.points.shape, generator=torch.Generator().manual_seed(0))
+    shape = replace(shape, points=shape.points + _THICKNESS * noise.to(shape.points))
     chain, axes = shape.joints.chain, [None] * shape.num_parts
     box = oriented_bounds(shape.part(chain.root).double().cpu().numpy(), angle_digits=2)[0]
     axes[chain.root] = torch.from_numpy(box[:3, :3].T.copy()).to(shape.points)

@@ -116,12 +116,13 @@ def test_clouds_that_are_turned_are_settled_alike(oven, dtype):
     frames.load_state_dict(oven[0].state_dict())
     frames.to(dtype)
     one = _cast(_explained(OVEN, data), dtype)
+    torch.manual_seed(0)
     turn = roma.random_rotmat(4).to(dtype)
     pose = se3(turn, torch.randn(4, 3, dtype=dtype))
     seen = data.points.to(dtype)
     still, _ = frames.settled(one, seen)
     moved, _ = frames.settled(one.at(pose[:, None] @ one.base, one.state), transform_points(pose, seen))
-    tolerance = 1e-2 if dtype == torch.float32 else 1e-7
+    tolerance = 1e-2 if dtype == torch.float32 else 1e-6  # learnt in float32
     torch.testing.assert_close(moved.base[:, 0], pose @ still.base[:, 0], atol=tolerance, rtol=0)
     torch.testing.assert_close(moved.state, still.state, atol=tolerance, rtol=0)
 
@@ -284,3 +285,13 @@ def test_an_estimate_with_dense_clouds_is_settled(oven, monkeypatch):
     module.predict_points(points[:, :POINTS])
     module.predict_points(points[:, :POINTS], refine=False, dense=points)
     assert seen == [4 * POINTS]
+
+
+@pytest.mark.parametrize("flat", [torch.tensor([1.0, 1.0, 0.0]), torch.tensor([0.0, 1.0, 0.0]), torch.zeros(3)])
+def test_what_has_collapsed_has_axes(flat):
+    """A sheet, a rod, a point: training must not end in an error of the hull."""
+    data = _data(LAPTOP, count=1)
+    shape = true_shape(LAPTOP, data)
+    axes = rough_axes(replace(shape, points=shape.points * flat))
+    torch.testing.assert_close(axes.mT @ axes, torch.eye(3).expand(2, 3, 3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(axes), torch.ones(2))
