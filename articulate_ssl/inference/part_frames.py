@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import roma
 import torch
@@ -203,7 +204,7 @@ class PartFrames(nn.Module):
         return one, moved
 
 
-class Faces:
+class Faces(NamedTuple):
     """Normals of B clouds, and how much each counts, by part.
 
     Attributes:
@@ -211,8 +212,8 @@ class Faces:
         weight: [B, K, m]; likewise.
     """
 
-    def __init__(self, normal: Tensor, weight: Tensor) -> None:
-        self.normal, self.weight = normal, weight
+    normal: Tensor
+    weight: Tensor
 
     def of(self, part: int) -> Faces:
         """Those of one part."""

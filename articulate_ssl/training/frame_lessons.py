@@ -39,10 +39,7 @@ def learn_part_frames(
     for some in announced(log, "faces of parts", clouds.split(_BATCH)):
         found.append(estimator.explained(some[:, :count], module.num_points, some))
         faces.append([faces_of(found[-1], some, [window] * module.num_parts) for window in WINDOWS])
-    every = tuple(
-        Faces(torch.cat([some.normal for some in seen]), torch.cat([some.weight for some in seen]))
-        for seen in zip(*faces, strict=True)
-    )
+    every = tuple(Faces(*map(torch.cat, zip(*seen, strict=True))) for seen in zip(*faces, strict=True))
     network = module.articulated
     start = rough_axes(network.category.articulated_shape(network.joint_type))
     quality = frames.learn(concatenated(found), every, start)
