@@ -5,7 +5,8 @@
    cloud in the part frames of the last winner (paper, Sec. 3.1).
 3. *Registration* at test time: the leading hypotheses' predicted shapes are registered to the cloud without leaving
    their joints, and the best reconstruction wins. What is decided for in the end takes the cloud's own proportions
-   (`proportions`), turned as its parts' faces say (`part_frames`).
+   (`proportions`), turned as its parts' faces say (`part_frames`), with the shape that clouds of the collection have
+   in common (`common_shape`).
    Where parts slide, clouds of other objects that are most like it decide which way round it is; where these are
    labelled, they say which parts points are of, and where the category's shape is (`sliding_search`).
    Where simulated views taught, those that a view is most like decide which way round it is, and say with the
@@ -46,6 +47,7 @@ from articulate_ssl.inference.candidates import (
     likelier,
     rivals,
 )
+from articulate_ssl.inference.common_shape import CommonShape
 from articulate_ssl.inference.handedness import Handedness, in_the_mirror
 from articulate_ssl.inference.hinge_sides import HingeSides
 from articulate_ssl.inference.options import InferenceOptions
@@ -87,6 +89,7 @@ class PoseEstimator:
         handedness: Whether clouds show the category's mirror image, if some do; a module owns it.
         hinge_sides: At which side objects are hinged, if not all at the same; a module owns it.
         part_frames: How the faces of parts lie; a module owns it.
+        common_shape: What training clouds have in common, if it was learnt; a module owns it.
         states: Which joint states training clouds showed; a module owns it.
     """
 
@@ -111,6 +114,7 @@ class PoseEstimator:
         self.hinge_sides = HingeSides()
         self.states = StateRange(articulated.num_parts - 1)
         self.part_frames = PartFrames(articulated.num_parts)
+        self.common_shape = CommonShape(articulated.num_parts)
 
     def align(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Stage 0: clouds turned roughly to canonical orientation [B, N, 3], and the pose [B, 4, 4] that undoes it."""
@@ -498,9 +502,12 @@ class PoseEstimator:
         if not self.inference.proportions or joint_type != REVOLUTE:
             return one
         frames, known = self.part_frames, None
+        category = self.articulated.category.articulated_shape(joint_type)
         if dense is not None and frames.learnt:
             one, known = frames.settled(one, dense)
-        category = self.articulated.category.articulated_shape(joint_type)
+            if self.common_shape.learnt:
+                category = self.common_shape.shape(category.joints)
+                one = replace(one, structure=replace(one.structure, pivot=self.common_shape.pivots(len(points))))
         # Complete clouds, and scans that teach views, show where a hinge is.
         both = self.observation.bidirectional
         touching = both and self.observation.orientation.limited

@@ -38,11 +38,32 @@ def fit_proportions(
     part is where (docs/experiments.md, step 118); joint lines are those of the explanations.
 
     Args:
+        category: Every part has as many points.
         touching: Both parts of a joint are drawn to its line (`InstanceFit.optimise`).
         faces: Axes along which parts stretch instead of their principal ones, which of a body about as wide as high
             are any; then it would shear.
         known: Which clouds stay turned as they are, and which joint states stay.
     """
+    fit, base = descended(one, category, points, cycles, bidirectional, touching, faces, known)
+    instances = fit.instances()
+    parts = torch.stack([instances.part(part) for part in range(instances.num_parts)], dim=1)
+    center = parts.mean(dim=2)
+    own = CanonicalShape(parts - center[:, :, None], center)
+    structure = replace(one.structure, pivot=instances.joints.pivot)
+    return replace(one, shape=own, structure=structure).at((base @ fit.base)[:, None], fit.state[:, None])
+
+
+def descended(
+    one: Hypotheses,  # H = 1
+    category: ArticulatedShape,
+    points: Tensor,  # [B, N, 3]
+    cycles: int,
+    bidirectional: bool = True,
+    touching: bool = False,
+    faces: Tensor | None = None,  # [K, 3, 3] columns
+    known: tuple[Tensor, Tensor] | None = None,  # [B], [B, J] bool
+) -> tuple[InstanceFit, Tensor]:  # , [B, 4, 4]
+    """See `fit_proportions`: the fit to clouds in the frames of explanations, and their poses before it."""
     # A test runs in inference mode, whose tensors no gradient goes through.
     with torch.inference_mode(False):
         lines = replace(category.joints, axis=one.axis[:, 0].clone(), pivot=one.pivot.clone())
@@ -54,9 +75,4 @@ def fit_proportions(
         fit = InstanceFit(shape, still, one.state[:, 0].clone(), torch.Generator().manual_seed(0), faces=faces)
         known = None if known is None else tuple(value.clone() for value in known)
         fit.optimise(seen, cycles, shared=False, bidirectional=bidirectional, touching=touching, known=known)
-        instances = fit.instances()
-        parts = torch.stack([instances.part(part) for part in range(shape.num_parts)], dim=1)
-        center = parts.mean(dim=2)
-        own = CanonicalShape(parts - center[:, :, None], center)
-        structure = replace(one.structure, pivot=instances.joints.pivot)
-        return replace(one, shape=own, structure=structure).at((base @ fit.base)[:, None], fit.state[:, None])
+        return fit, base

@@ -1,4 +1,7 @@
-"""What `inference.part_frames` is learnt from: how faces of parts lie in predictions of training clouds."""
+"""What `inference.part_frames` and `inference.common_shape` are learnt from: predictions of training clouds.
+
+How the faces of their parts lie, and then, where these say how clouds are turned, what they have in common.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,15 @@ import torch
 from torch import Tensor
 from trimesh.bounds import oriented_bounds
 
+from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.inference.part_frames import WINDOWS, Faces, faces_of
-from articulate_ssl.network.hypotheses import concatenated
+from articulate_ssl.inference.proportions import descended
+from articulate_ssl.network.hypotheses import Hypotheses, concatenated
 from articulate_ssl.ops.progress import announced
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
+from articulate_ssl.shape.fusion import fused
 from articulate_ssl.shape.object_axes import object_axes
+from articulate_ssl.shape.part_maps import PartMaps
 from articulate_ssl.training.explanations import registered_points
 
 if TYPE_CHECKING:
@@ -22,6 +29,7 @@ if TYPE_CHECKING:
 
 _BATCH = 16
 _THICKNESS = 1e-4  # in normalised units
+_CLOUDS, _BEST = 128, 0.7  # that are laid over each other, and of them the share that fits best: some are turned over
 
 log = logging.getLogger(__name__)
 
@@ -31,10 +39,14 @@ def learn_part_frames(
     module: ArticulatedPoseModule,
     clouds: Tensor,  # [n, N, 3] farthest-point order, dense
 ) -> None:
-    """Find out which parts have faces that say how they are turned."""
+    """Find out which parts have faces that say how they are turned, and then which shape clouds have in common.
+
+    The latter of complete clouds alone.
+    """
     estimator, count = module.estimator, registered_points(module)
     frames = estimator.part_frames
     frames.flat.fill_(False)
+    estimator.common_shape.forget()
     found, faces = [], []
     for some in announced(log, "faces of parts", clouds.split(_BATCH)):
         found.append(estimator.explained(some[:, :count], module.num_points, some))
@@ -42,10 +54,40 @@ def learn_part_frames(
     every = tuple(Faces(*map(torch.cat, zip(*seen, strict=True))) for seen in zip(*faces, strict=True))
     network = module.articulated
     start = rough_axes(network.category.articulated_shape(network.joint_type))
-    quality = frames.learn(concatenated(found), every, start)
+    explained = concatenated(found)
+    quality = frames.learn(explained, every, start)
     for part, (share, angle) in enumerate(quality.tolist()):
         flat = "has" if frames.flat[part] else "has no"
         log.info("part %d %s faces: %.0f %% of clouds alike, %.1f degrees", part, flat, 100 * share, angle)
+    if frames.learnt and not estimator.observation.orientation.limited:
+        rows = torch.arange(min(_CLOUDS, len(clouds)), device=clouds.device)
+        _learn_common_shape(module, explained.rows(rows), clouds[rows])
+
+
+def _learn_common_shape(module: ArticulatedPoseModule, explained: Hypotheses, clouds: Tensor) -> None:
+    """Lay the clouds that fit best over each other, part by part."""
+    estimator, network = module.estimator, module.articulated
+    frames, category = estimator.part_frames, network.category.articulated_shape(network.joint_type)
+    one, known = frames.settled(explained, clouds)
+    fit, base = descended(
+        one,
+        category,
+        clouds[:, : registered_points(module)],
+        estimator.inference.proportions,
+        True,
+        False,
+        frames.axes,
+        known,
+    )
+    seen = transform_points(invert_se3(base), clouds)
+    best = fit.error(seen).argsort()[: int(_BEST * len(clouds))]
+    maps = fit.maps()
+    pivot = fit.shape.joints.pivot[best].median(dim=0).values
+    axis = torch.where(frames.measured[:, None], frames.direction, category.joints.axis)
+    shape = replace(category, joints=replace(category.joints, axis=axis, pivot=pivot))
+    shape = fused(shape, PartMaps(maps.linear[best], maps.shift[best]), seen[best])
+    if shape is not None:
+        estimator.common_shape.set(shape)
 
 
 def rough_axes(shape: ArticulatedShape) -> Tensor:  # [K, 3, 3] columns

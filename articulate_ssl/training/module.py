@@ -85,7 +85,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         handedness_samples: Training clouds of an upright camera from which it is learnt whether some objects are mirror
             images of the others (`inference.handedness`); 0 learns nothing of it.
         part_frames_samples: Training clouds from which it is learnt which parts have faces that say how they are
-            turned, where parts turn (`inference.part_frames`); 0 learns nothing of it.
+            turned, where parts turn (`inference.part_frames`), and if so, of complete clouds, which shape they have in
+            common (`inference.common_shape`); 0 learns nothing of it.
         hinge_sides_samples: Training clouds in any orientation from which it is learnt whether some objects are hinged
             at another side than most (`inference.hinge_sides`); 0 learns nothing of it.
         orientation_range: How far objects are turned from their mean orientation at most, in degrees; 180 stands for
@@ -142,7 +143,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         self.two_ways, self.sliding = self.estimator.two_ways, self.estimator.sliding
         self.view_search, self.handedness = self.estimator.view_search, self.estimator.handedness
         self.hinge_sides, self.states = self.estimator.hinge_sides, self.estimator.states
-        self.part_frames = self.estimator.part_frames
+        self.part_frames, self.common_shape = self.estimator.part_frames, self.estimator.common_shape
         self.recipe = recipe_type(self.estimator, objective, schedule, discovery)
         self.radius = RadiusStatistics()
         self.confidence = Confidence()
