@@ -61,9 +61,10 @@ def fused(
         found = _seen_again(back[part], label == part)
         found = found if part == root else _largest_piece(found)
         old = shape.part(part).cpu().numpy()
-        found = np.concatenate([old[_to_lines(old, lines) < _NEAR_LINE], found[_to_lines(found, lines) >= _NEAR_LINE]])
+        found = found[_to_lines(found, lines) >= _NEAR_LINE]
         if len(found) < _FEWEST:
             return None
+        found = np.concatenate([old[_to_lines(old, lines) < _NEAR_LINE], found])
         seen.append(found[farthest_point_order(found, min(FUSED_POINTS, len(found)))])
     points = [np.resize(found, (FUSED_POINTS, 3)) for found in _equally_dense(seen)]
     label = torch.arange(shape.num_parts, device=device).repeat_interleave(FUSED_POINTS)
