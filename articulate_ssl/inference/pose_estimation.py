@@ -501,18 +501,23 @@ class PoseEstimator:
         joint_type = one.structure.joint_type
         if not self.inference.proportions or joint_type != REVOLUTE:
             return one
-        frames, known = self.part_frames, None
-        category = self.articulated.category.articulated_shape(joint_type)
-        if dense is not None and frames.learnt:
-            one, known = frames.settled(one, dense)
-            if self.common_shape.learnt:
-                category = self.common_shape.shape(category.joints)
-                one = replace(one, structure=replace(one.structure, pivot=self.common_shape.pivots(len(points))))
+        cycles, category = self.inference.proportions, self.articulated.category.articulated_shape(joint_type)
         # Complete clouds, and scans that teach views, show where a hinge is.
         both = self.observation.bidirectional
         touching = both and self.observation.orientation.limited
-        faces = None if known is None else frames.axes
-        return fit_proportions(one, category, points, self.inference.proportions, both, touching, faces, known)
+        frames = self.part_frames
+        if dense is None or not frames.learnt:
+            return fit_proportions(one, category, points, cycles, both, touching)
+        one, known = frames.settled(one, dense)
+        if not self.common_shape.learnt:
+            return fit_proportions(one, category, points, cycles, both, touching, frames.axes, known)
+        # Registered with another shape, a part may be so far off that faces of others are taken for its own.
+        category = self.common_shape.shape(category.joints)
+        one = replace(one, structure=replace(one.structure, pivot=self.common_shape.pivots(len(points))))
+        first = fit_proportions(one, category, points, cycles, both, touching, frames.axes, known)
+        settled, known = frames.settled(first, dense)
+        one = one.at(settled.base, settled.state)
+        return fit_proportions(one, category, points, cycles, both, touching, frames.axes, known)
 
     def _distance(
         self,
