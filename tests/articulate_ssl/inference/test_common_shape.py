@@ -61,17 +61,26 @@ def test_weights_from_before_have_none():
 
 
 def test_it_takes_proportions_where_faces_are_known(monkeypatch):
-    module, seen = _learnt_module(), []
+    """And faces are looked at again from there: what they say then is where the last fit starts."""
+    module, seen, looks = _learnt_module(), [], []
 
     def kept(one, category, *_rest):
-        seen.append((category.points.shape[0], one.pivot[0, 0].tolist()))
+        seen.append((category.points.shape[0], one.pivot[0, 0].tolist(), float(one.state[0, 0, 0])))
         return one
 
+    def settled(one, dense):
+        looks.append(len(seen))
+        known = torch.ones(len(dense), dtype=torch.bool), torch.ones(len(dense), 1, dtype=torch.bool)
+        return one.at(one.base, torch.full_like(one.state, 0.1 * len(looks))), known
+
     monkeypatch.setattr(pose_estimation, "fit_proportions", kept)
+    monkeypatch.setattr(module.part_frames, "settled", settled)
     points = torch.randn(1, 4 * POINTS, 3, generator=torch.Generator().manual_seed(0)) / 4
     module.predict_points(points[:, :POINTS], dense=points)
     module.predict_points(points[:, :POINTS])  # without dense clouds there are no faces
     own = module.articulated.category.template.shape[:2].numel()
-    assert [count for count, _ in seen] == [200, own]
-    torch.testing.assert_close(seen[0][1], [0.1, 0.2, 0.3])
-    assert seen[1][1] != seen[0][1]
+    assert looks == [0, 1]
+    assert [count for count, _, _ in seen] == [200, 200, own]
+    for at, state in ((0, 0.1), (1, 0.2)):
+        torch.testing.assert_close(seen[at][1:], ([0.1, 0.2, 0.3], state))
+    assert seen[2][1] != seen[0][1]
