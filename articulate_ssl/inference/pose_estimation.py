@@ -6,7 +6,7 @@
 3. *Registration* at test time: the leading hypotheses' predicted shapes are registered to the cloud without leaving
    their joints, and the best reconstruction wins. What is decided for in the end takes the cloud's own proportions
    (`proportions`), turned as its parts' faces say (`part_frames`), with the shape that clouds of the collection have
-   in common (`common_shape`).
+   in common (`common_shape`), after which faces are looked at again.
    Where parts slide, clouds of other objects that are most like it decide which way round it is; where these are
    labelled, they say which parts points are of, and where the category's shape is (`sliding_search`).
    Where simulated views taught, those that a view is most like decide which way round it is, and say with the
