@@ -116,6 +116,12 @@ class PoseEstimator:
         self.part_frames = PartFrames(articulated.num_parts)
         self.common_shape = CommonShape(articulated.num_parts)
 
+    @property
+    def reads_dense(self) -> bool:
+        """Whether what is decided or measured in the end reads all points of a cloud."""
+        decides = self.two_ways.learnt or self.two_ways.surface is not None or self.hinge_sides.learnt
+        return bool(decides or self.part_frames.learnt)
+
     def align(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Stage 0: clouds turned roughly to canonical orientation [B, N, 3], and the pose [B, 4, 4] that undoes it."""
         if self.rigid is None:

@@ -75,7 +75,7 @@ def _predict_together(
     estimates = []
     for i, (points, center, scale) in enumerate(zip(clouds, centers, scales, strict=True)):
         one, other = prediction[i : i + 1], rival[i : i + 1]
-        if estimator.two_ways.learnt:
+        if estimator.reads_dense:
             dense = _scaled(points, center, [scale]).to(batch)
             one, other = estimator.predict_with_rivals(batch[i : i + 1], num_points, refine, dense)
         other = other if one.margin < 1 else None
