@@ -55,7 +55,7 @@ def fused(
     posed = maps.move(shape.points, shape.label)
     distance = torch.stack([nearest_distance(clouds, posed[:, shape.label == part]) for part in parts], dim=-1)
     label = _labelled(distance.cpu().numpy(), back)
-    lines = [(axis.cpu().numpy(), pivot.cpu().numpy()) for axis, pivot in zip(*_lines(shape), strict=True)]
+    lines = list(zip(shape.joints.axis.cpu().numpy(), shape.joints.pivot.cpu().numpy(), strict=True))
     root, seen = shape.joints.chain.root, []
     for part in parts:
         found = _seen_again(back[part], label == part)
@@ -114,7 +114,7 @@ def _seen_again(moved: np.ndarray, own: np.ndarray) -> np.ndarray:
 
 
 def _centred(point: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """A point moved along the normal of the surfaces about it to their middle, so that edges stay where they are."""
+    """A point moved along the normal of the surfaces about it to their middle."""
     if len(near) < _FEWEST:
         return point
     middle = near.mean(axis=0)
@@ -129,10 +129,6 @@ def _largest_piece(points: np.ndarray) -> np.ndarray:
     linked = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(points), len(points)))
     piece = connected_components(linked, directed=False)[1]
     return points[piece == np.bincount(piece).argmax()]
-
-
-def _lines(shape: ArticulatedShape) -> tuple[Tensor, Tensor]:
-    return shape.joints.axis, shape.joints.pivot
 
 
 def _to_lines(points: np.ndarray, lines: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
