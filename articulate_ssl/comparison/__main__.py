@@ -11,6 +11,7 @@ from pathlib import Path
 
 from articulate_ssl.comparison.figure import draw
 from articulate_ssl.comparison.jobs import SAMPLES, Job, Setting, make_data
+from articulate_ssl.comparison.measured import Measured
 from articulate_ssl.comparison.results import collect
 from articulate_ssl.comparison.rows import learners, rows_of
 from articulate_ssl.comparison.spread import do_jobs
@@ -63,16 +64,22 @@ def _compare(category: str, names: tuple[str, ...], args: argparse.Namespace) ->
         args.test_source,
         args.test_root,
     )
-    try:
-        make_data(setting, names, _say)
-    except StageFailed as error:
-        _say(str(error))
-        return False
+    measured = Measured(args.measured)
     # One seed of all first, so that an early table is whole.
     defined = [name for name in names if any(args.view in row.views for row in rows_of(name))]
     jobs = [Job(setting, name, seed) for seed in range(args.seeds) for name in defined]
-    failed = do_jobs([job for job in jobs if not job.finished], args.workers, args.scheduler)
-    results = collect(setting, names, range(args.seeds), list(failed.values()))
+    failed: dict[Job, str] = {}
+    if missing := [job for job in jobs if not (job.finished or measured.knows(job))]:
+        try:
+            make_data(setting, tuple(job.learner for job in missing), _say)
+        except StageFailed as error:
+            _say(str(error))
+            return False
+        failed = do_jobs(missing, args.workers, args.scheduler)
+    for file in measured.keep(jobs):
+        _say(f"{file}: kept")
+    results = collect(setting, names, range(args.seeds), list(failed.values()), measured)
+    args.build.mkdir(parents=True, exist_ok=True)  # where all results were kept, no job made it
     out = args.build / setting.name
     writers: dict[str, Callable] = {".md": as_markdown, ".csv": as_csv, ".json": as_json}
     for suffix, written in writers.items():
@@ -107,6 +114,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--configs", nargs="*", default=[], type=Path, help="configuration files of recipes behind the cpu profile")
     add("--data-options", type=shlex.split, default=[], help="words for the generator, as one argument")
     add("--workers", type=int, default=1, help="jobs at once on this machine; default: 1")
+    add("--measured", type=Path, help="folder of results to keep, and to take instead of measuring them again")
     add("--scheduler", help="address of a Dask scheduler (tcp://…) to spread jobs over machines instead")
     return parser
 

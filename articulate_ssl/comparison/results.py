@@ -12,6 +12,7 @@ from typing import Any
 import yaml
 
 from articulate_ssl.comparison.jobs import Job, Setting
+from articulate_ssl.comparison.measured import Measured
 from articulate_ssl.comparison.rows import Row, rows_of
 from articulate_ssl.comparison.statistics import Estimate, combined
 from articulate_ssl.geometry.screw import REVOLUTE
@@ -77,15 +78,23 @@ class Results:
     failed: tuple[str, ...]
 
 
-def collect(setting: Setting, learners: Sequence[str], seeds: Sequence[int], failed: Sequence[str]) -> Results:
-    """Read the reports of all jobs that have finished."""
+def collect(
+    setting: Setting,
+    learners: Sequence[str],
+    seeds: Sequence[int],
+    failed: Sequence[str],
+    measured: Measured = Measured(),  # noqa: B008 frozen
+) -> Results:
+    """Read the reports of all jobs that have finished here, or of which one is kept."""
     found, reports = [], []
     for learner in learners:
         for row in rows_of(learner):
             jobs = [Job(setting, learner, seed) for seed in seeds] if setting.view in row.views else []
-            finished = [job for job in jobs if job.finished]
-            own = [job.report(row.column) for job in finished]
-            found.append(_row_result(row, tuple(job.seed for job in finished), own, setting))
+            finished = {job.seed: job.report(row.column) for job in jobs if job.finished}
+            kept = {job.seed: measured.report(job, row.column) for job in jobs if measured.knows(job)}
+            by_seed = dict(sorted((kept | finished).items()))
+            own = list(by_seed.values())
+            found.append(_row_result(row, tuple(by_seed), own, setting))
             reports += own
     first = reports[0] if reports else _NO_REPORT
     counts = first["samples"], first["instances"]

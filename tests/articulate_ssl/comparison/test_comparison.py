@@ -13,6 +13,7 @@ from articulate_ssl.baselines import METHODS
 from articulate_ssl.comparison import __main__ as command
 from articulate_ssl.comparison import jobs as jobs_module
 from articulate_ssl.comparison.jobs import Job, Setting, make_data
+from articulate_ssl.comparison.measured import Measured
 from articulate_ssl.comparison.results import Results, RowResult, collect
 from articulate_ssl.comparison.rows import QUANTITIES, Row, learners, rows_of
 from articulate_ssl.comparison.spread import do_jobs
@@ -203,6 +204,45 @@ def test_trainings_are_tested_on_other_objects_too(tmp_path, programs, capsys):
     assert "| 4.0 [3.0, 5.0] |" in (build / "laptop-complete.md").read_text()
     assert command.main([*options, "--test-source", "hoi4d"]) == 2
     assert "make data CAT=laptop VIEW=complete SOURCE=hoi4d" in capsys.readouterr().err
+
+
+def test_results_that_are_kept_are_not_measured_again(tmp_path, programs, capsys):
+    (tmp_path / "data" / "laptop" / "procedural-complete").mkdir(parents=True)
+    (tmp_path / "data" / "laptop" / "procedural-complete" / "manifest.json").touch()
+    kept, methods = tmp_path / "kept", ("--methods", "oracle_icp", "op_align")
+    first = [*methods, "--root", str(tmp_path / "data"), "--build", str(tmp_path / "one"), "--measured", str(kept)]
+    assert command.main([*first, "--seeds", "2"]) == 0
+    table = (tmp_path / "one" / "laptop-complete.md").read_text()
+    assert sorted(file.name for file in (kept / "laptop-complete").iterdir()) == [
+        f"{name}-{seed}.json" for name in ("op_align", "oracle_icp") for seed in (0, 1)
+    ]
+    count = len(programs.commands)
+    # Another machine, without the data: one more seed would need them, the same two do not.
+    elsewhere = [*methods, "--build", str(tmp_path / "two"), "--measured", str(kept)]
+    assert command.main([*elsewhere, "--seeds", "2"]) == 0
+    assert len(programs.commands) == count
+    assert (tmp_path / "two" / "laptop-complete.md").read_text() == table
+    assert command.main([*first, "--seeds", "3"]) == 0
+    assert len(programs.commands) == count + 2 and (kept / "laptop-complete" / "op_align-2.json").is_file()
+    # Of another effort they are other results, and without the option nothing is known of them.
+    other = Job(_setting(tmp_path, steps=7), "oracle_icp", 0)
+    same = Job(_setting(tmp_path), "oracle_icp", 0)
+    assert Measured(kept).knows(same) and not Measured(kept).knows(other) and not Measured().knows(same)
+    (kept / "laptop-complete" / "op_align-0.json").write_text("{}")
+    capsys.readouterr()
+    assert command.main([*elsewhere, "--seeds", "2"]) == 2
+    assert "op_align-0.json" in capsys.readouterr().err
+
+
+def test_of_a_recipe_all_ways_to_predict_are_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(Job, "finished", True)
+    shifts = {"no_network": 0.0, "network": 1.0, "network_registered": 2.0}
+    monkeypatch.setattr(Job, "report", lambda _self, column: _report(shifts[column]))
+    job, measured = Job(_setting(tmp_path), "staged", 0), Measured(tmp_path / "kept")
+    (file,) = measured.keep([job])
+    assert measured.keep([job]) == [] and file == measured.file(job)
+    for column, shift in shifts.items():
+        assert measured.report(job, column)["r_err_deg"]["mean"] == 4.0 + shift
 
 
 def test_what_is_not_defined_or_not_there_is_a_dash(tmp_path, monkeypatch):
