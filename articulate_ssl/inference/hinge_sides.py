@@ -154,13 +154,16 @@ class HingeSides(WithSurface):
         self,
         prediction: Prediction,  # joint states count from the closed door
         dense: Tensor,  # [B, P, 3]
-    ) -> Prediction:
+    ) -> tuple[Prediction, Tensor]:  # , [B]
         """The same, its frame turned so that the body looks right; its margin is at most how sure that is.
 
         Where less is seen of a body than the network reads, nothing is decided.
+
+        Returns:
+            That, and by how many quarters frames were turned.
         """
         if dense.shape[1] < LOOKS * self.size.read:
-            return prediction
+            return prediction, torch.zeros(len(dense), dtype=torch.long, device=dense.device)
         bodies = self.bodies(prediction, dense, (dense,))
         odds = self.looks_right(bodies) + self.log_prior[: len(self.quarters)].to(dense)
         best, ways = odds.topk(2, dim=1)
@@ -168,7 +171,7 @@ class HingeSides(WithSurface):
         sure = torch.where(bodies.known, sure, torch.inf).tanh()
         quarters = torch.where(bodies.known, self.quarters[ways[:, 0]], 0)
         turned = turned_about(prediction, bodies.frames[:, 0, :, 2], quarters)
-        return replace(turned, margin=prediction.margin.minimum(sure))
+        return replace(turned, margin=prediction.margin.minimum(sure)), quarters
 
     def looks_right(self, bodies: Bodies) -> Tensor:  # [B, W]
         """How right bodies look, as they are, in each of their ways."""

@@ -24,18 +24,13 @@ Training takes the first two steps too; nothing here knows a loss or an optimise
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-import roma
 import torch
 from torch import Tensor
 
-from articulate_ssl.discovery.registration import chamfer_l1, register_articulated
-from articulate_ssl.discovery.search import search_articulated
-from articulate_ssl.geometry.rotation_group import rotation_group
-from articulate_ssl.geometry.screw import REVOLUTE
+from articulate_ssl.discovery.registration import chamfer_l1
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
 from articulate_ssl.inference.candidates import (
     ANOTHER_WAY,
@@ -48,13 +43,14 @@ from articulate_ssl.inference.candidates import (
     rivals,
 )
 from articulate_ssl.inference.common_shape import CommonShape
+from articulate_ssl.inference.final_fit import FinalFit
 from articulate_ssl.inference.handedness import Handedness, in_the_mirror
 from articulate_ssl.inference.hinge_sides import HingeSides
+from articulate_ssl.inference.hypothesis_registration import HypothesisRegistration
 from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.inference.packaging import as_prediction
 from articulate_ssl.inference.part_frames import PartFrames
 from articulate_ssl.inference.prediction import Prediction
-from articulate_ssl.inference.proportions import fit_proportions
 from articulate_ssl.inference.relief import NUM_FEATURES, relief_of
 from articulate_ssl.inference.sliding_search import SlidingSearch
 from articulate_ssl.inference.state_range import StateRange
@@ -66,8 +62,8 @@ from articulate_ssl.network.articulated_network import ArticulatedNetwork
 from articulate_ssl.network.heads.shape import CanonicalShape
 from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.network.rigid_alignment import RigidAlignment
-from articulate_ssl.ops.chamfer import chamfer, hypothesis_distances
-from articulate_ssl.shape.observation import FAR, Observation
+from articulate_ssl.ops.chamfer import hypothesis_distances
+from articulate_ssl.shape.observation import Observation
 
 
 class PoseEstimator:
@@ -115,6 +111,10 @@ class PoseEstimator:
         self.states = StateRange(articulated.num_parts - 1)
         self.part_frames = PartFrames(articulated.num_parts)
         self.common_shape = CommonShape(articulated.num_parts)
+        self.registration = HypothesisRegistration(inference, observation, self.states)
+        self.final = FinalFit(
+            articulated, self.registration, self.part_frames, self.common_shape, inference.proportions
+        )
 
     @property
     def reads_dense(self) -> bool:
@@ -147,27 +147,6 @@ class PoseEstimator:
             if number + 1 < self.iterations:
                 start = hypotheses.select(iteration.winner)
                 labels = distances_to_parts(points, start.posed()[:, 0]).argmin(dim=-1)
-
-    @torch.no_grad()
-    def register(
-        self,
-        candidates: Hypotheses,  # H of each cloud: where to start, and what is registered
-        points: Tensor,  # [B, N, 3]
-        scales: tuple[float, float],
-        rounds: int,
-    ) -> tuple[Tensor, Tensor, Tensor]:  # [B, H, 4, 4], [B, H, J], [B, H]
-        """Register the predicted shapes to the clouds (`register_articulated`): base poses, joint states, errors."""
-        count = candidates.base.shape[1]
-        registered = register_articulated(
-            candidates.articulated_shape(),
-            points.repeat_interleave(count, dim=0),
-            candidates.base.flatten(0, 1),
-            candidates.state.flatten(0, 1),
-            scales,
-            rounds,
-            self.observation.bidirectional,
-        )
-        return tuple(value.unflatten(0, (-1, count)) for value in registered)
 
     @torch.no_grad()
     def predict(
@@ -214,7 +193,9 @@ class PoseEstimator:
         if self.hinge_sides.learnt:
             seen = [self.hinge_sides.counted_from_closed(one) for one in seen]
             if dense is not None:
-                seen[0] = self.hinge_sides.decided(seen[0], dense)
+                seen[0], quarters = self.hinge_sides.decided(seen[0], dense)
+                if fits and (self.inference.refine if refine is None else refine) is not False:
+                    seen[0] = self._as_most_are(seen[0], quarters, points, dense)
         if not self.handedness.learnt:
             return tuple(seen)
         dense = None if dense is None else in_the_mirror(dense)
@@ -241,11 +222,35 @@ class PoseEstimator:
         with torch.autocast(points.device.type, enabled=False):
             registers = (self.inference.refine if refine is None else refine) is not False
             chosen, other, margin, votes = self._chosen(points, num_points, registers, dense)
-            error = self._distance(chosen, points)
+            error = self.final.distance(chosen, points)
             if registers and fits:
-                chosen = self._in_proportion(chosen, points, dense)
+                chosen, other, margin = self.final.within_limits(chosen, other, margin, points, dense)
             rival = self._packaged(other, points, torch.zeros_like(margin))
             return self._packaged(chosen, points, margin, votes), rival, error
+
+    def _as_most_are(
+        self,
+        turned: Prediction,  # joint states count from the closed door
+        quarters: Tensor,  # [B] by which frames were turned
+        points: Tensor,  # [B, N, 3]
+        dense: Tensor,  # [B, P, 3]
+    ) -> Prediction:
+        """Predictions whose frames were turned, or, if that fits better, objects in these frames hinged as most are.
+
+        Either an object is hinged at another side, or it stood wrongly and its hinge was sought on the wrong one.
+        """
+        rows = quarters.nonzero()[:, 0]
+        if not len(rows):
+            return turned
+        own, seen, middle = points[rows], dense[rows], self.states.starts()[:1].to(points)
+        base = turned.base_pose[rows, None]
+        start = self.articulated.category_at(base, middle.expand(len(rows), 1, -1))
+        tried = self.final.in_proportion(self.registration.freed(start, own), own, seen)
+        packaged = self.hinge_sides.counted_from_closed(self._packaged(tried, own, turned.margin[rows]))
+        as_turned = angle_to(tried.base[..., :3, :3], base[:, 0, :3, :3])[:, 0] < ANOTHER_WAY
+        fits = packaged.reconstruction_error < turned.reconstruction_error[rows]
+        better = (as_turned & fits & self.states.contains(tried.state[:, 0])).nonzero()[:, 0]
+        return turned.with_rows(rows[better], packaged[better])
 
     @torch.no_grad()
     def explained(
@@ -313,24 +318,11 @@ class PoseEstimator:
         alone = (frames[:, 0] == frames[:, 1]).flatten(1).all(dim=1)
         stuck = (chosen.base != one.base).flatten(1).any(dim=1).nonzero()[:, 0]
         if registers and len(stuck):
-            freed = self._freed(chosen.rows(stuck), points[stuck])
+            freed = self.registration.freed(chosen.rows(stuck), points[stuck])
             chosen = chosen.at(
                 chosen.base.index_copy(0, stuck, freed.base), chosen.state.index_copy(0, stuck, freed.state)
             )
         return chosen, other, torch.where(alone, margin, decided)
-
-    def _freed(
-        self,
-        one: Hypotheses,  # H = 1
-        points: Tensor,  # [B, N, 3]
-    ) -> Hypotheses:  # H = 1
-        """Explanations registered again from other joint states, the best that is turned as before."""
-        starts = self.states.starts().to(points)
-        copies = one.select(torch.zeros(len(points), 1 + len(starts), dtype=torch.long, device=points.device))
-        state = torch.cat([one.state, starts.expand(len(points), -1, -1)], dim=1)
-        found, error = self._registered(copies.at(copies.base, state), points)
-        away = angle_to(found.base[..., :3, :3], one.base[:, 0, :3, :3]) > ANOTHER_WAY
-        return found.select(error.masked_fill(away, torch.inf).argmin(dim=1))
 
     def _best(self, candidates: Candidates) -> tuple[Hypotheses, Hypotheses, Tensor]:
         """The best candidate of every cloud, its rival, and the margin between them [B]."""
@@ -371,7 +363,7 @@ class PoseEstimator:
         *_, last = self.iterate(aligned)
         if registers:
             turn = None if turn is None else pose[:, :3, :3].mT @ turn
-            candidates, error = self._refine(last, transform_points(invert_se3(pose), points), turn)
+            candidates, error = self.registration.leading(last, transform_points(invert_se3(pose), points), turn)
         else:
             candidates, error = last.hypotheses, last.distance
         candidates = candidates.at(pose[:, None] @ candidates.base, candidates.state)
@@ -426,7 +418,7 @@ class PoseEstimator:
         """
         base, state, margin, votes = self.view_search.search(points)
         likelier, rival = (self.articulated.category_at(base[:, i, None], state[:, i, None]) for i in range(2))
-        first, error = self._registered(likelier, points)
+        first, error = self.registration.registered(likelier, points)
         if num_points is None:
             return first, rival, margin, votes
         turn = base[:, 0, :3, :3]
@@ -445,8 +437,7 @@ class PoseEstimator:
         start = one.at(pose[:, None, one.chain.root], state[:, None])
         if not registers:
             return start
-        scales = self.inference.coarse_scale, self.inference.fine_scale
-        base, state, _ = self.register(start, points, scales, self.inference.rounds)
+        base, state, _ = self.registration.register(start, points)
         return one.at(base, state)
 
     def _relief(
@@ -465,9 +456,8 @@ class PoseEstimator:
     ) -> Prediction:
         """Predictions of the category's shape and joints alone: no network has a say, a decision by relief has.
 
-        They are searched (`search_articulated`) from the 60 rotations of the icosahedron, those within the orientation
-        range, and from the joint states where `StateRange` starts; 3 for one joint. Where parts slide, `sliding_search`
-        takes the place of that, if there are dense clouds, and `view_search` where simulated views taught.
+        They are searched from everywhere (`FinalFit.search`). Where parts slide, `sliding_search` takes the place of
+        that, if there are dense clouds, and `view_search` where simulated views taught.
         """
         seen, error = self._searched(points, dense)
         if not self.handedness.learnt:
@@ -480,97 +470,28 @@ class PoseEstimator:
         """See `search`: by the category's own hand; and the errors [B] before proportions."""
         with torch.autocast(points.device.type, enabled=False):
             if self.view_search.learnt:
-                found, _, margin, votes = self._seen(points)
-                shown = self._in_proportion(found, points, dense)
-                return self._packaged(shown, points, margin, votes), self._distance(found, points)
+                found, other, margin, votes = self._seen(points)
+                return self._fitted(found, other, margin, points, dense, votes)
             if dense is not None and self.sliding.learnt:
                 found, _, margin, votes = self._slid(points, dense)
-                return self._packaged(found, points, margin, votes), self._distance(found, points)
-            rotations = rotation_group(60).elements.to(points)
-            rotations = rotations[self.observation.orientation.contains(rotations)]
-            shape = self.articulated.category.articulated_shape(self.articulated.joint_type)
-            base, state, error = search_articulated(shape, points, rotations, self.states.starts().to(points))
-            candidates = Candidates(error, base, self.articulated.category_at(base, state).select)
-            found, _, margin = self._best(candidates)
+                return self._packaged(found, points, margin, votes), self.final.distance(found, points)
+            found, other, margin = self._best(self.final.search(points))
             if dense is not None and self.two_ways.learnt:
-                found, _, margin = self._decided(found, points, dense, registers=True)
-            shown = self._in_proportion(found, points, dense)
-            return self._packaged(shown, points, margin), self._distance(found, points)
+                found, other, margin = self._decided(found, points, dense, registers=True)
+            return self._fitted(found, other, margin, points, dense)
 
-    def _in_proportion(
+    def _fitted(
         self,
         one: Hypotheses,  # H = 1
+        rival: Hypotheses,  # H = 1
+        margin: Tensor,  # [B]
         points: Tensor,  # [B, N, 3]
         dense: Tensor | None,  # [B, P, 3]
-    ) -> Hypotheses:  # H = 1
-        """Explanations in the proportions of clouds (`fit_proportions`), turned as faces say, where parts turn."""
-        joint_type = one.structure.joint_type
-        if not self.inference.proportions or joint_type != REVOLUTE:
-            return one
-        cycles, category = self.inference.proportions, self.articulated.category.articulated_shape(joint_type)
-        # Complete clouds, and scans that teach views, show where a hinge is.
-        both = self.observation.bidirectional
-        touching = both and self.observation.orientation.limited
-        frames = self.part_frames
-        if dense is None or not frames.learnt:
-            return fit_proportions(one, category, points, cycles, both, touching)
-        one, known = frames.settled(one, dense)
-        if not self.common_shape.learnt:
-            return fit_proportions(one, category, points, cycles, both, touching, frames.axes, known)
-        # Registered with another shape, a part may be so far off that faces of others are taken for its own.
-        category = self.common_shape.shape(category.joints)
-        one = replace(one, structure=replace(one.structure, pivot=self.common_shape.pivots(len(points))))
-        first = fit_proportions(one, category, points, cycles, both, touching, frames.axes, known)
-        settled, known = frames.settled(first, dense)
-        one = one.at(settled.base, settled.state)
-        return fit_proportions(one, category, points, cycles, both, touching, frames.axes, known)
-
-    def _distance(
-        self,
-        one: Hypotheses,  # H = 1
-        points: Tensor,  # [B, N, 3]
-    ) -> Tensor:  # [B]
-        """Of explanations from their clouds."""
-        return chamfer(points, one.posed()[:, 0].flatten(1, 2), bidirectional=self.observation.bidirectional)
-
-    def _refine(self, last: Iteration, points: Tensor, turn: Tensor | None) -> tuple[Hypotheses, Tensor]:
-        """The leading hypotheses after articulated registration of the predicted shape, and their errors."""
-        ranked, rotation = last.ranked, last.hypotheses.base[..., :3, :3]
-        if turn is not None:
-            ranked = ranked + FAR * (angle_to(rotation, turn) > ANOTHER_WAY)
-        leading = ranked.topk(min(self.inference.candidates, ranked.shape[1]), largest=False).indices
-        return self._registered(last.hypotheses.select(leading), points)
-
-    def _registered(
-        self,
-        candidates: Hypotheses,  # H = C
-        points: Tensor,  # [B, N, 3]
-    ) -> tuple[Hypotheses, Tensor]:  # H = C, [B, C]
-        """Hypotheses after articulated registration of their shapes, and their errors."""
-        options = self.inference
-        scales = options.coarse_scale, options.fine_scale
-        base, state, error = self.register(candidates, points, scales, options.rounds)
-        registered = candidates.at(base, state)
-        if options.most_turned >= 180:
-            return registered, error
-        return self._believed(candidates, registered, error, points)
-
-    def _believed(
-        self,
-        candidates: Hypotheses,  # H = C
-        registered: Hypotheses,  # H = C
-        error: Tensor,  # [B, C] of those
-        points: Tensor,  # [B, N, 3]
-    ) -> tuple[Hypotheses, Tensor]:
-        """Registered hypotheses, or what they were before if one of their parts was turned too far; and the errors."""
-        before, after = (some.object_pose()[..., :3, :3] for some in (candidates, registered))
-        turned = roma.rotmat_geodesic_distance(before, after).amax(dim=-1)  # [B, C]
-        kept = turned <= math.radians(self.inference.most_turned)
-        copies = points[:, None].expand(-1, error.shape[1], -1, -1).flatten(0, 1)
-        own = chamfer_l1(copies, candidates.posed().flatten(0, 1).flatten(1, 2), self.observation.bidirectional)
-        base = torch.where(kept[..., None, None], registered.base, candidates.base)
-        state = torch.where(kept[..., None], registered.state, candidates.state)
-        return candidates.at(base, state), torch.where(kept, error, own.view_as(error))
+        votes: Tensor | None = None,  # [B, N, K]
+    ) -> tuple[Prediction, Tensor]:
+        """Explanations in the clouds' proportions, packaged; and their errors [B] before that."""
+        shown, _, margin = self.final.within_limits(one, rival, margin, points, dense)
+        return self._packaged(shown, points, margin, votes), self.final.distance(one, points)
 
     def _packaged(
         self,
@@ -581,5 +502,5 @@ class PoseEstimator:
     ) -> Prediction:
         """See `as_prediction`."""
         neighbours = self.inference.part_neighbours or 1
-        distance = self._distance(chosen, points)
+        distance = self.final.distance(chosen, points)
         return as_prediction(chosen, points, distance, margin, self.posterior_scale, neighbours, votes)

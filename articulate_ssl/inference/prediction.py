@@ -64,6 +64,11 @@ class Prediction:
         """A sub-batch (slice, mask or index tensor) of every field."""
         return Prediction(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
+    def with_rows(self, index: Tensor, other: Prediction) -> Prediction:
+        """The same, but clouds [n] as `other`, which is of these, has them."""
+        names = [f.name for f in fields(self)]
+        return Prediction(**{n: getattr(self, n).index_copy(0, index, getattr(other, n)) for n in names})
+
     def to(self, device) -> Prediction:
         """Every field on `device`."""
         return Prediction(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})

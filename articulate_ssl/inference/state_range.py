@@ -1,4 +1,4 @@
-"""Which joint states training clouds showed, and where a search for those of others starts."""
+"""Which joint states training clouds showed: where a search for those of others starts, and what no joint does."""
 
 from __future__ import annotations
 
@@ -7,18 +7,54 @@ from torch import Tensor, nn
 
 _RANGE_WEIGHT = 0.02  # of a batch
 _SIDE = 1 / 3  # of the width of a joint's range, from its middle
+# Share of the states at either end that do not count, as some predictions are wrong. States are taken for spread
+# evenly, so the range is wider by as much.
+_LEFT_OUT = 0.05
+_SLACK = 0.05  # of the width of a joint's range, beyond it: some degrees, which predictions are off by. Chosen.
 
 
 class StateRange(nn.Module):
-    """Running means of the lowest and of the highest joint state of each batch: narrower than all states seen.
+    """Joint states of training clouds.
 
     Attributes:
-        limits: [J, 2].
+        limits: [J, 2] running means of the lowest and of the highest of each batch: narrower than all states seen.
+        seen: [J, 2] lowest and highest of what is predicted of training clouds in the end; equal until they are learnt.
     """
 
     def __init__(self, num_joints: int) -> None:
         super().__init__()
         self.register_buffer("limits", torch.zeros(num_joints, 2))
+        self.register_buffer("seen", torch.zeros(num_joints, 2))
+
+    def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
+        state_dict.setdefault(f"{prefix}seen", torch.zeros_like(self.seen))  # weights from before they were learnt
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+    @property
+    def learnt(self) -> bool:
+        """Whether it is known what is predicted in the end."""
+        return bool((self.seen[:, 1] > self.seen[:, 0]).all())
+
+    def learn(
+        self,
+        state: Tensor,  # [n, J] of predictions of training clouds, of which a few may be wrong
+    ) -> None:
+        """Take over which states there are."""
+        ends = torch.tensor([_LEFT_OUT, 1 - _LEFT_OUT]).to(state)
+        low, high = state.quantile(ends, dim=0)
+        more = (high - low) * _LEFT_OUT / (1 - 2 * _LEFT_OUT)
+        self.seen.copy_(torch.stack([low - more, high + more], dim=-1))
+
+    def contains(
+        self,
+        state: Tensor,  # [B, J]
+    ) -> Tensor:  # [B] bool
+        """Whether all joints are within what is known, or about; everything, until it is."""
+        if not self.learnt:
+            return torch.ones_like(state[:, 0], dtype=torch.bool)
+        low, high = self.seen.unbind(-1)
+        slack = _SLACK * (high - low)
+        return ((state >= low - slack) & (state <= high + slack)).all(dim=1)
 
     def starts(self) -> Tensor:  # [1 + 2^J, J]
         """Where to start looking for joint states: the middle of the range, and in every combination either side."""

@@ -101,6 +101,21 @@ class Hypotheses:
             association_logits=self.association_logits[index],
         )
 
+    def with_rows(self, index: Tensor, other: Hypotheses) -> Hypotheses:
+        """The same, but clouds [n] as `other`, which is of these, has them; part proposals stay."""
+
+        def put(own: Tensor, new: Tensor) -> Tensor:
+            return own.index_copy(0, index, new.to(own))
+
+        lines = {name: put(getattr(self.structure, name), getattr(other.structure, name)) for name in LINES}
+        return replace(
+            self,
+            shape=CanonicalShape(*map(put, self.shape, other.shape)),
+            structure=replace(self.structure, **lines),
+            base=put(self.base, other.base),
+            state=put(self.state, other.state),
+        )
+
     def at(
         self,
         base: Tensor,  # [B, H, 4, 4]

@@ -209,7 +209,7 @@ class TrainingRecipe(Recipe):
 
     def _registered(self, iteration: Iteration, winner: Tensor, selected: Hypotheses) -> PoseTarget:
         """Where registration moves the winner [B], if that is better; else where it is."""
-        moved = self.estimator.register(selected, iteration.points, _SCALES, _ROUNDS)
+        moved = self.estimator.registration.register(selected, iteration.points, _SCALES, _ROUNDS)
         base, state, after = (value[:, 0] for value in moved)
         better = after < iteration.distance.gather(1, winner[:, None])[:, 0]
         return PoseTarget(

@@ -4,7 +4,7 @@ import torch
 from articulated_objects import OVEN, clouds, true_shape
 from tiny import POINTS, tiny_module
 
-from articulate_ssl.inference import pose_estimation
+from articulate_ssl.inference import final_fit
 from articulate_ssl.inference.common_shape import CommonShape
 from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.training.checkpoint import load_module
@@ -73,7 +73,7 @@ def test_it_takes_proportions_where_faces_are_known(monkeypatch):
         known = torch.ones(len(dense), dtype=torch.bool), torch.ones(len(dense), 1, dtype=torch.bool)
         return one.at(one.base, torch.full_like(one.state, 0.1 * len(looks))), known
 
-    monkeypatch.setattr(pose_estimation, "fit_proportions", kept)
+    monkeypatch.setattr(final_fit, "fit_proportions", kept)
     monkeypatch.setattr(module.part_frames, "settled", settled)
     points = torch.randn(1, 4 * POINTS, 3, generator=torch.Generator().manual_seed(0)) / 4
     module.predict_points(points[:, :POINTS], dense=points)

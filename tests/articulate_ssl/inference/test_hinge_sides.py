@@ -195,19 +195,19 @@ def test_a_lying_object_stands_up():
     prediction, dense, true = _lying([0, 1, 2, 3])
     sides = _sides()
     sides.surface = _TopIsUp()
-    decided = sides.decided(sides.counted_from_closed(prediction), dense)
+    decided, _ = sides.decided(sides.counted_from_closed(prediction), dense)
     _same_in_camera_space(decided, prediction)
     _holds(decided)
     off = roma.rotmat_geodesic_distance(decided.base_pose[:, :3, :3], true).rad2deg()
     assert off.max() < 2
     # Where odds are not to be believed to the letter, they are the same way, less sure.
     sides.surface.temperature.fill_(1e6)
-    unsure = sides.decided(sides.counted_from_closed(prediction), dense)
+    unsure, _ = sides.decided(sides.counted_from_closed(prediction), dense)
     torch.testing.assert_close(unsure.base_pose, decided.base_pose)
     assert (unsure.margin < decided.margin).all()
     # Rarely seen sides take more to be believed.
     sides.log_prior.copy_(torch.tensor([0.0, -1e3, -1e3, -1e3]))
-    kept = sides.decided(sides.counted_from_closed(prediction), dense)
+    kept, _ = sides.decided(sides.counted_from_closed(prediction), dense)
     torch.testing.assert_close(kept.base_pose, prediction.base_pose)
 
 
@@ -216,7 +216,7 @@ def test_upside_down_is_told_by_whole_clouds_too():
     sides = _sides()
     sides.whole.fill_(True)
     sides.surface = _TopIsUp(up=0, size=SIZE)
-    decided = sides.decided(sides.counted_from_closed(prediction), dense)
+    decided, _ = sides.decided(sides.counted_from_closed(prediction), dense)
     _same_in_camera_space(decided, prediction)
     off = roma.rotmat_geodesic_distance(decided.base_pose[:, :3, :3], true).rad2deg()
     assert off.max() < 2
@@ -277,7 +277,7 @@ def test_where_too_little_is_behind_the_door_nothing_is_decided():
     sides = _sides()
     sides.surface = _TopIsUp()
     for count in (700, 300):
-        kept = sides.decided(prediction, dense[:, :count])
+        kept, _ = sides.decided(prediction, dense[:, :count])
         torch.testing.assert_close(kept.base_pose, prediction.base_pose)
         assert torch.equal(kept.margin, prediction.margin)
 

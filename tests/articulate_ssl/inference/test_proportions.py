@@ -11,7 +11,7 @@ from tiny import POINTS, tiny_module
 from articulate_ssl.discovery.registration import chamfer_l1, register_articulated
 from articulate_ssl.geometry.orientation_range import OrientationRange
 from articulate_ssl.geometry.se3 import se3, transform_points
-from articulate_ssl.inference import pose_estimation
+from articulate_ssl.inference import final_fit
 from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.inference.proportions import fit_proportions
 from articulate_ssl.network.heads.shape import CanonicalShape
@@ -21,6 +21,11 @@ from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.observation import Observation
 
 CYCLES = 25
+
+
+def _observe(module, observation: Observation) -> None:
+    """As if it had been trained so."""
+    module.estimator.observation = module.estimator.registration.observation = observation
 
 
 def _category(design, data: Clouds) -> ArticulatedShape:
@@ -88,10 +93,13 @@ def test_a_cloud_that_is_turned_is_explained_alike_and_so_is_one_alone():
     torch.testing.assert_close(alone.base[0], every.base[2], atol=5e-3, rtol=0)
     turn = roma.rotvec_to_rotmat(torch.randn(4, 3, generator=torch.Generator().manual_seed(3)))
     pose = se3(turn, torch.zeros(4, 3))
-    turned = fit_proportions(start.at(pose[:, None] @ start.base, start.state), shape, data.points @ turn.mT, CYCLES)
-    # What is rounded otherwise, 150 steps of descent amplify to a tenth of a degree.
-    torch.testing.assert_close(turned.state, every.state, atol=5e-3, rtol=0)
-    torch.testing.assert_close(turned.base, pose[:, None] @ every.base, atol=5e-3, rtol=0)
+    # What is rounded otherwise, steps of descent amplify, by processors in different ways: from few of them.
+    few = 4
+    every = fit_proportions(start, shape, data.points, few)
+    assert (every.base - start.base).abs().amax() > 5e-3
+    turned = fit_proportions(start.at(pose[:, None] @ start.base, start.state), shape, data.points @ turn.mT, few)
+    torch.testing.assert_close(turned.state, every.state, atol=2e-3, rtol=0)
+    torch.testing.assert_close(turned.base, pose[:, None] @ every.base, atol=2e-3, rtol=0)
 
 
 def test_it_runs_in_inference_mode():
@@ -107,9 +115,9 @@ def test_it_runs_in_inference_mode():
 def test_registered_clouds_take_proportions_and_what_the_network_says_alone_does_not(unidirectional):
     module = tiny_module(inference=InferenceOptions(refine=True)).eval()
     points = torch.rand(3, POINTS, 3, generator=torch.Generator().manual_seed(6)) - 0.5
-    module.estimator.observation = Observation(unidirectional=unidirectional)
+    _observe(module, Observation(unidirectional=unidirectional))
     own, alone = (module.estimator.predict(points, POINTS, refine=refine) for refine in (True, False))
-    module.estimator.inference = replace(module.estimator.inference, proportions=0)
+    module.estimator.final.cycles = 0
     assert not torch.equal(module.estimator.predict(points, POINTS).part_shape, own.part_shape)
     assert torch.equal(module.estimator.predict(points, POINTS, refine=False).part_shape, alone.part_shape)
 
@@ -159,9 +167,9 @@ def test_parts_are_drawn_to_a_hinge_that_floats(monkeypatch):
     assert apart(drawn).max() < 0.055
     # Parts of complete clouds are not.
     seen = []
-    monkeypatch.setattr(pose_estimation, "fit_proportions", lambda *args: seen.append(args[4:6]) or args[0])
+    monkeypatch.setattr(final_fit, "fit_proportions", lambda *args: seen.append(args[4:6]) or args[0])
     for views, unidirectional in ((60.0, False), (180.0, False), (60.0, True)):
         module = tiny_module(orientation_range=views).eval()
-        module.estimator.observation = Observation(OrientationRange(views), unidirectional)
+        _observe(module, Observation(OrientationRange(views), unidirectional))
         module.predict_points(torch.rand(1, POINTS, 3))
     assert seen == [(True, True), (True, False), (False, False)]

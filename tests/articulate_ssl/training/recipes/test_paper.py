@@ -75,10 +75,13 @@ def test_stage_0_does_not_count():
 def test_the_papers_tests_are_not_registered_unless_asked(recipe, asked, registered):
     module = tiny_module(recipe=recipe, inference=InferenceOptions(refine=asked))
     assert module.inference.refine is registered
-    before, module.estimator.register = module.estimator.register, _note(module.estimator.register, calls := [])
+    before, module.estimator.registration.register = (
+        module.estimator.registration.register,
+        _note(module.estimator.registration.register, calls := []),
+    )
     module.eval().predict_points(_clouds(2))
     assert bool(calls) is registered
-    module.estimator.register = before
+    module.estimator.registration.register = before
 
 
 def _note(function, calls):

@@ -1,0 +1,148 @@
+"""What is decided for takes the cloud's own proportions, and gives way where its joints are as none was seen.
+
+Of an oven whose door is open wide, the door may be taken for that of the bottom: both explanations fit alike, but the
+other door would be open farther than any. Joint limits are those of what is predicted of training clouds
+(`state_range`); no label is read.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from articulate_ssl.discovery.search import search_articulated
+from articulate_ssl.geometry.rotation_group import rotation_group
+from articulate_ssl.geometry.screw import REVOLUTE
+from articulate_ssl.inference.candidates import Candidates
+from articulate_ssl.inference.common_shape import CommonShape
+from articulate_ssl.inference.hypothesis_registration import HypothesisRegistration
+from articulate_ssl.inference.part_frames import PartFrames
+from articulate_ssl.inference.proportions import fit_proportions
+from articulate_ssl.network.articulated_network import ArticulatedNetwork
+from articulate_ssl.network.hypotheses import Hypotheses
+from articulate_ssl.ops.chamfer import chamfer
+
+# How much larger the error of what is within the joints' limits may be. Of ovens that were explained by a door beyond
+# them, the right explanation's was up to 1.23 times the other's (docs/experiments.md, step 144). Chosen.
+_ABOUT_AS_WELL = 1.3
+
+
+class FinalFit:
+    """Fits explanations to clouds in the end.
+
+    Args:
+        articulated: The network, for the category's own shape.
+        registration: Of hypotheses; says which joint states there are.
+        part_frames: How the faces of parts lie.
+        common_shape: What training clouds have in common.
+        cycles: Of descent; 0 leaves proportions out.
+    """
+
+    def __init__(
+        self,
+        articulated: ArticulatedNetwork,
+        registration: HypothesisRegistration,
+        part_frames: PartFrames,
+        common_shape: CommonShape,
+        cycles: int,
+    ) -> None:
+        self.articulated, self.registration = articulated, registration
+        self.part_frames, self.common_shape, self.cycles = part_frames, common_shape, cycles
+
+    @property
+    def fits(self) -> bool:
+        """Whether explanations take proportions: not where parts slide."""
+        return bool(self.cycles) and self.articulated.joint_type == REVOLUTE
+
+    def in_proportion(
+        self,
+        one: Hypotheses,  # H = 1
+        points: Tensor,  # [B, N, 3]
+        dense: Tensor | None,  # [B, P, 3]
+    ) -> Hypotheses:  # H = 1
+        """Explanations in the proportions of clouds (`fit_proportions`), turned as faces say, where parts turn."""
+        if not self.fits:
+            return one
+        cycles, category = self.cycles, self.articulated.category.articulated_shape(self.articulated.joint_type)
+        observation, frames = self.registration.observation, self.part_frames
+        # Complete clouds, and scans that teach views, show where a hinge is.
+        both = observation.bidirectional
+        touching = both and observation.orientation.limited
+        if dense is None or not frames.learnt:
+            return fit_proportions(one, category, points, cycles, both, touching)
+        one, known = frames.settled(one, dense)
+        if not self.common_shape.learnt:
+            return fit_proportions(one, category, points, cycles, both, touching, frames.axes, known)
+        # Registered with another shape, a part may be so far off that faces of others are taken for its own.
+        category = self.common_shape.shape(category.joints)
+        one = replace(one, structure=replace(one.structure, pivot=self.common_shape.pivots(len(points))))
+        first = fit_proportions(one, category, points, cycles, both, touching, frames.axes, known)
+        settled, known = frames.settled(first, dense)
+        one = one.at(settled.base, settled.state)
+        return fit_proportions(one, category, points, cycles, both, touching, frames.axes, known)
+
+    def within_limits(
+        self,
+        one: Hypotheses,  # H = 1
+        rival: Hypotheses,  # H = 1
+        margin: Tensor,  # [B]
+        points: Tensor,  # [B, N, 3]
+        dense: Tensor | None,  # [B, P, 3]
+    ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
+        """Explanations in the clouds' proportions; those whose joints are where none was seen give way to others.
+
+        These are the same from other joint states, rivals, and what a search finds with the category's shape, if they
+        are within what was seen and explain a cloud about as well. Nothing is sure then, so the margin is 0.
+        """
+        fitted = self.in_proportion(one, points, dense)
+        out = (~self._within(fitted)).nonzero()[:, 0]
+        if not (self.fits and len(out)):
+            return fitted, rival, margin
+        own, seen, before = points[out], None if dense is None else dense[out], one.rows(out)
+        least = _ABOUT_AS_WELL * self.distance(fitted, points)[out]
+        for start, same in ((before, True), (rival.rows(out), False), (self._searched(own), False)):
+            tried = self.in_proportion(self.registration.freed(start, own), own, seen)
+            error = self.distance(tried, own)
+            better = (self._within(tried) & (error < least)).nonzero()[:, 0]
+            least[better] = error[better]
+            fitted = fitted.with_rows(out[better], tried.rows(better))
+            if not same:
+                rival = rival.with_rows(out[better], before.rows(better))
+                margin = margin.index_fill(0, out[better], 0.0)
+        return fitted, rival, margin
+
+    def distance(
+        self,
+        one: Hypotheses,  # H = 1
+        points: Tensor,  # [B, N, 3]
+    ) -> Tensor:  # [B]
+        """Of explanations from their clouds."""
+        both = self.registration.observation.bidirectional
+        return chamfer(points, one.posed()[:, 0].flatten(1, 2), bidirectional=both)
+
+    def search(self, points: Tensor) -> Candidates:
+        """Of clouds [B, N, 3] the registrations of the category's shape from everywhere (`search_articulated`).
+
+        From the 60 rotations of the icosahedron, those within the orientation range, and from the joint states where
+        `StateRange` starts; 3 for one joint.
+        """
+        rotations = rotation_group(60).elements.to(points)
+        rotations = rotations[self.registration.observation.orientation.contains(rotations)]
+        shape = self.articulated.category.articulated_shape(self.articulated.joint_type)
+        starts = self.registration.states.starts().to(points)
+        base, state, error = search_articulated(shape, points, rotations, starts)
+        return Candidates(error, base, self.articulated.category_at(base, state).select)
+
+    def _searched(self, points: Tensor) -> Hypotheses:
+        """The best that is found within the joints' limits, H = 1."""
+        found = self.search(points)
+        every = torch.arange(found.error.shape[1], device=points.device).expand(len(points), -1)
+        state = found.select(every).state
+        allowed = self.registration.states.contains(state.flatten(0, 1)).view_as(found.error)
+        turned = self.registration.observation.orientation.contains(found.base[..., :3, :3])
+        return found.select(found.error.masked_fill(~(allowed & turned), torch.inf).argmin(dim=1))
+
+    def _within(self, one: Hypotheses) -> Tensor:  # [B] bool
+        return self.registration.states.contains(one.state[:, 0])
