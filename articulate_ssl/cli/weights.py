@@ -1,4 +1,4 @@
-"""`articulate-ssl weights list|show|pack|rebuild|check`: the weights that come with the package."""
+"""`articulate-ssl weights list|show|pack|rebuild|teach|check`: the weights that come with the package."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from articulate_ssl.training.weights_card import CARD_SUFFIX, HEADLINES, VIEWS, 
 _HEADINGS = ("R", ">30°", "flips", "T", "axis", "pivot", "state", "mIoU")
 _NOT_REPRODUCED = 1  # the exit code
 _BUILD = Path("build/weights")
+_LESSONS = Path("build/weights-teach")
 _CHECKS = Path("build/weights-check")
 _CHECK_SEED = 12
 
@@ -41,7 +42,7 @@ def run(arguments: list[str]) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="articulate-ssl weights", description="Weights that come with the package.")
-    commands = parser.add_subparsers(required=True, metavar="list|show|pack|rebuild|check")
+    commands = parser.add_subparsers(required=True, metavar="list|show|pack|rebuild|teach|check")
     commands.add_parser("list", help="which there are, and what they are worth").set_defaults(do=_list)
 
     show = commands.add_parser("show", help="print the card of one")
@@ -61,6 +62,13 @@ def _parser() -> argparse.ArgumentParser:
     rebuild.add_argument("--build", type=Path, default=_BUILD, help=f"for data, runs and logs (default: {_BUILD})")
     rebuild.add_argument("--folder", type=Path, default=WEIGHTS_FOLDER, help="where to (default: the package)")
     rebuild.set_defaults(do=_rebuild)
+
+    teach = commands.add_parser("teach", help="what is learnt after training, anew: lessons without labels, and a test")
+    teach.add_argument("names", nargs="+", help="categories or names")
+    teach.add_argument("--lessons", nargs="+", help="default: all that apply; each builds on those before")
+    teach.add_argument("--build", type=Path, default=_LESSONS, help=f"for data and notes (default: {_LESSONS})")
+    teach.add_argument("--folder", type=Path, default=WEIGHTS_FOLDER, help="where to (default: the package)")
+    teach.set_defaults(do=_teach)
 
     check = commands.add_parser("check", help="test on fresh data and compare with the cards")
     check.add_argument("names", nargs="*", help="categories or names (default: all)")
@@ -115,6 +123,21 @@ def _rebuild(args: argparse.Namespace) -> int:
     if failed:
         print("articulate-ssl weights: not all could be made:", *failed, sep="\n  ", file=sys.stderr)
     return _NOT_REPRODUCED if failed else 0
+
+
+def _teach(args: argparse.Namespace) -> int:
+    from articulate_ssl.pretrained.stages import StageFailed
+    from articulate_ssl.pretrained.teach import Teaching
+    from articulate_ssl.training.module import LESSONS
+
+    try:
+        for weights in [weights for name in args.names for weights in _named(name)]:
+            card = Teaching(weights, tuple(args.lessons or LESSONS), args.build, args.folder).run(_say)
+            print(card.markdown())
+    except StageFailed as error:
+        print(f"articulate-ssl weights: {error}", file=sys.stderr)
+        return _NOT_REPRODUCED
+    return 0
 
 
 def _check(args: argparse.Namespace) -> int:

@@ -8,7 +8,6 @@ again. Without it everything is measured anew.
 from __future__ import annotations
 
 import json
-import subprocess
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any
 
 from articulate_ssl.comparison.jobs import Job
 from articulate_ssl.comparison.rows import rows_of
+from articulate_ssl.pretrained.rebuild import commit_of
 from datamodules.atomic import atomic_write
 
 # What a table reads is kept, and what a reader needs to know which run it was; curves and calibrations are not.
@@ -53,7 +53,7 @@ class Measured:
                 continue
             columns = [row.column for row in rows_of(job.learner)]
             reports = {column or job.learner: _without(job.report(column)) for column in columns}
-            content = {"effort": _effort(job), "commit": _commit(), "reports": reports}
+            content = {"effort": _effort(job), "commit": commit_of(Path(__file__).parent), "reports": reports}
             (file := self.file(job)).parent.mkdir(parents=True, exist_ok=True)
             with atomic_write(file) as stream:
                 stream.write((json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
@@ -81,10 +81,3 @@ def _effort(job: Job) -> dict[str, Any]:
 def _without(report: dict[str, Any]) -> dict[str, Any]:
     joint_type = {"calibration": {"joint_type": report["calibration"]["joint_type"]}}
     return {name: value for name, value in report.items() if name not in _LEFT_OUT} | joint_type
-
-
-def _commit() -> str | None:
-    """Of the checkout; None outside one."""
-    command = ["git", "rev-parse", "--short", "HEAD"]
-    found = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parent)
-    return found.stdout.strip() or None

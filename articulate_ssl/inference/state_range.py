@@ -35,6 +35,15 @@ class StateRange(nn.Module):
         """Whether it is known what is predicted in the end."""
         return bool((self.seen[:, 1] > self.seen[:, 0]).all())
 
+    @property
+    def known(self) -> Tensor:  # [J, 2]
+        """Lowest and highest state, as well as they are known."""
+        return self.seen if self.learnt else self.limits
+
+    def forget(self) -> None:
+        """As before they were learnt."""
+        self.seen.zero_()
+
     def learn(
         self,
         state: Tensor,  # [n, J] of predictions of training clouds, of which a few may be wrong

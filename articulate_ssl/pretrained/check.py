@@ -27,6 +27,7 @@ from scipy.stats import binom
 from articulate_ssl.inference.checkpoint_file import CheckpointError
 from articulate_ssl.metrics.report import JSON_NAME
 from articulate_ssl.training.checkpoint import load_module
+from articulate_ssl.training.module import ArticulatedPoseModule
 from articulate_ssl.training.shipped_weights import ShippedWeights
 from articulate_ssl.training.weights_card import CARD_SUFFIX, HEADLINES, WeightsCard
 from datamodules.articulated_data_module import ArticulatedDataModule
@@ -86,15 +87,16 @@ def check(
     if seed == card.data["seed"]:
         raise CheckpointError(f"seed {seed} is that of the data behind {weights.name}; take another")
     place = build / f"{weights.name}-seed-{seed}"
-    tested, digest = place / "tested.json", hashlib.sha256(weights.file.read_bytes()).hexdigest()
-    if not tested.is_file() or json.loads(tested.read_text())["sha256"] != digest:
+    note, digest = place / "tested.json", hashlib.sha256(weights.file.read_bytes()).hexdigest()
+    if not note.is_file() or json.loads(note.read_text())["sha256"] != digest:
         say(f"{weights.name}: data of seed {seed} …")
         _make_data(card, seed, place)
         say(f"{weights.name}: test …")
-        metrics = _test(weights, card, place)
-        with atomic_write(tested) as file:
+        module = load_module(weights.file)
+        metrics = tested(module, data_of(card, place / "data", module.num_points), place)
+        with atomic_write(note) as file:
             file.write(json.dumps({"sha256": digest, "metrics": metrics}).encode())
-    return compare(weights.name, card.metrics, json.loads(tested.read_text())["metrics"])
+    return compare(weights.name, card.metrics, json.loads(note.read_text())["metrics"])
 
 
 def compare(
@@ -146,16 +148,20 @@ def _make_data(card: WeightsCard, seed: int, place: Path) -> None:
         raise CheckpointError(f"{place}: the data could not be made (exit code {code}); {log} says why")
 
 
-def _test(weights: ShippedWeights, card: WeightsCard, place: Path) -> dict[str, Any]:
-    module = load_module(weights.file)
-    data = ArticulatedDataModule(
+def data_of(card: WeightsCard, root: Path, num_points: int) -> ArticulatedDataModule:
+    """Data as the card's are, in a folder that `render.generate` wrote to."""
+    return ArticulatedDataModule(
         card.category,
-        root=str(place / "data"),
+        root=str(root),
         view="complete" if card.view == "complete" else "partial",
-        num_points=module.num_points,
+        num_points=num_points,
         batch_size=_BATCH,
         max_test_samples=card.metrics["samples"],
     )
+
+
+def tested(module: ArticulatedPoseModule, data: ArticulatedDataModule, place: Path) -> dict[str, Any]:
+    """The content of the `metrics.json` that a test leaves in a folder."""
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     trainer = Trainer(
         accelerator="cpu",

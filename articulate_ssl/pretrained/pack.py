@@ -15,19 +15,17 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import torch
 import yaml
 
 from articulate_ssl.inference.checkpoint_file import CheckpointError
 from articulate_ssl.metrics.report import JSON_NAME, MULTI_STATE
 from articulate_ssl.training.checkpoint import load_module
 from articulate_ssl.training.module import ArticulatedPoseModule
-from articulate_ssl.training.self_agreement import look_twice
+from articulate_ssl.training.set_clouds import SetClouds
 from articulate_ssl.training.shipped_weights import WEIGHTS_FOLDER, ShippedWeights
 from articulate_ssl.training.weights_card import CARD_SUFFIX, HEADLINES, WeightsCard
 from articulate_ssl.training.weights_file import SUFFIX, write_weights
 from datamodules.articulated_data_module import ArticulatedDataModule
-from datamodules.articulated_dataset import split_labels
 from datamodules.manifest import Manifest, set_folder
 
 VIEW_OF_DATA = {"complete": "complete", "partial": "depth"}
@@ -195,9 +193,7 @@ def _learn_confidence(module: ArticulatedPoseModule, data: dict[str, Any]) -> No
     if module.confidence.learnt:
         return
     own = {name: data[name] for name in ("category", "root", "source", "view", "num_points")}
-    loader = ArticulatedDataModule(**own).discovery_dataloader(module.calibration_samples)
-    clouds = torch.cat([split_labels(batch)[0]["dense_points"] for batch in loader]).float()
-    module.confidence.learn(*look_twice(module, clouds))
+    module.learn_what_predictions_are_worth(SetClouds(ArticulatedDataModule(**own)), ("confidence",))
 
 
 def _refuse_other_options(

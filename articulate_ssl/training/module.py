@@ -38,12 +38,13 @@ from articulate_ssl.training.explanations import learn_handedness, learn_two_way
 from articulate_ssl.training.frame_lessons import learn_part_frames
 from articulate_ssl.training.hinge_lessons import learn_hinge_sides
 from articulate_ssl.training.hub import HubWeights
+from articulate_ssl.training.joint_limits import learn_joint_limits
 from articulate_ssl.training.label_free_report import LabelFreeReport
 from articulate_ssl.training.recipes import recipe_class
 from articulate_ssl.training.recipes.recipe import Outcome
 from articulate_ssl.training.running_statistics import RadiusStatistics
 from articulate_ssl.training.schedule import ScheduleOptions
-from articulate_ssl.training.self_agreement import LearnConfidence, look_twice
+from articulate_ssl.training.self_agreement import LearnConfidence, learn_confidence
 from articulate_ssl.training.set_clouds import SetClouds
 from articulate_ssl.training.test_report import TestReport
 from datamodules.articulated_dataset import split_labels
@@ -51,6 +52,8 @@ from datamodules.articulated_dataset import split_labels
 log = logging.getLogger(__name__)
 
 JOINT_TYPES = {"revolute": REVOLUTE, "prismatic": PRISMATIC}
+# What is learnt after the last step, in this order: each reads what those before it have learnt.
+LESSONS = ("two_ways", "handedness", "part_frames", "hinge_sides", "joint_limits", "confidence")
 # Terms of the loss, by the names that they are logged under.
 _LOGGED = {
     "loss": "loss",
@@ -78,7 +81,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         discovery: Effort of part discovery (staged recipe).
         inference: Refinement at test time.
         calibration_samples: Training clouds on which `lightning test` relates slots and canonical spaces to labels, and
-            from which confidence is learnt without them.
+            from which joint limits (`inference.state_range`) and confidence are learnt without them.
         two_ways_samples: Training clouds from which the decision between two explanations is learnt, of those that fit
             alike (`inference.two_ways`) or of predictions and their rivals (`inference.surface_decision`); 0 learns
             none.
@@ -156,8 +159,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
 
     @property
     def state_range(self) -> Tensor:
-        """[J, 2] lowest and highest joint state in training, on average over batches, as predictions count them."""
-        return self.states.limits - self.hinge_sides.closed * self.hinge_sides.learnt
+        """[J, 2] lowest and highest joint state of training clouds, as predictions count them."""
+        return self.states.known - self.hinge_sides.closed * self.hinge_sides.learnt
 
     # Prediction
 
@@ -193,23 +196,32 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         error = relative_error(prediction, points.to(prediction.margin))
         return self.confidence.probability(prediction.margin, error), self.confidence.unlike(error)
 
-    def learn_what_predictions_are_worth(self) -> None:
-        """Learn from training clouds which of two explanations is right, and how far predictions can be trusted."""
+    def learn_what_predictions_are_worth(self, training_clouds: SetClouds, lessons: Sequence[str] = LESSONS) -> None:
+        """Learn from training clouds what decides and measures in the end, and how far predictions can be trusted.
+
+        Args:
+            training_clouds: Of which a fixed subset teaches each lesson.
+            lessons: Which of `LESSONS`, each on top of what was learnt before; what does not apply teaches nothing.
+        """
         training = self.training
         self.eval()
+        turns, refines = self.articulated.joint_type == REVOLUTE, bool(self.inference.refine)
+        any_way = not self.orientation.limited
         # Where the frames of the collection have said which way round clouds are, nothing is left to decide.
-        decides = self.two_ways_samples and not self.orientation.limited and not self.sliding.learnt
-        if decides and self.inference.refine:
-            learn_two_ways(self, self._training_clouds(self.two_ways_samples).to(self.device))
-        if self.handedness_samples and self.orientation.limited:
-            learn_handedness(self, self._training_clouds(self.handedness_samples).to(self.device))
-        turns = self.articulated.joint_type == REVOLUTE
-        if self.part_frames_samples and self.inference.refine and turns:
-            learn_part_frames(self, self._training_clouds(self.part_frames_samples).to(self.device))
-        if self.hinge_sides_samples and self.inference.refine and not self.orientation.limited:
-            learn_hinge_sides(self, self._training_clouds(self.hinge_sides_samples).to(self.device))
-        clouds = self._training_clouds(self.calibration_samples).to(self.device)
-        self.confidence.learn(*look_twice(self, clouds))
+        decides = refines and any_way and not self.sliding.learnt
+        calibration = self.calibration_samples
+        plan = {
+            "two_ways": (learn_two_ways, self.two_ways_samples if decides else 0),
+            "handedness": (learn_handedness, 0 if any_way else self.handedness_samples),
+            "part_frames": (learn_part_frames, self.part_frames_samples if refines and turns else 0),
+            "hinge_sides": (learn_hinge_sides, self.hinge_sides_samples if refines and any_way else 0),
+            "joint_limits": (learn_joint_limits, calibration if refines and turns else 0),
+            "confidence": (learn_confidence, calibration),
+        }
+        for lesson in LESSONS:
+            learn, samples = plan[lesson]
+            if lesson in lessons and samples:
+                learn(self, training_clouds.clouds(samples).to(self.device))
         self.train(training)
 
     # Training
@@ -278,10 +290,6 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
     def _step_generator(self) -> torch.Generator:
         """Of what is random in this step, the same on every rank."""
         return torch.Generator().manual_seed(self.global_step)
-
-    def _training_clouds(self, count: int) -> Tensor:
-        """A fixed subset of the training clouds [n, N, 3] with all their points."""
-        return SetClouds(self.trainer.datamodule).clouds(count)
 
     @torch.no_grad()
     def _track(self, outcome: Outcome) -> None:

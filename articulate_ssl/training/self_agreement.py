@@ -17,6 +17,7 @@ from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.metrics.functional import ABOVE_DEG
 from articulate_ssl.ops.farthest_point import farthest_point_order
 from articulate_ssl.ops.progress import announced
+from articulate_ssl.training.set_clouds import SetClouds
 
 if TYPE_CHECKING:
     from articulate_ssl.training.module import ArticulatedPoseModule
@@ -36,7 +37,7 @@ class LearnConfidence(Callback):
     def on_train_batch_end(self, trainer, pl_module: ArticulatedPoseModule, *_) -> None:
         """At the last step only."""
         if trainer.global_step == trainer.max_steps and pl_module.calibration_samples:
-            pl_module.learn_what_predictions_are_worth()
+            pl_module.learn_what_predictions_are_worth(SetClouds(trainer.datamodule))
 
 
 def another_look(
@@ -92,3 +93,11 @@ def look_twice(
     error, margin, agrees = (torch.cat(values) for values in zip(*found, strict=True))
     log.info("%d of %d training clouds are predicted alike a second time", int(agrees.sum()), len(agrees))
     return error, margin, agrees
+
+
+def learn_confidence(
+    module: ArticulatedPoseModule,
+    clouds: Tensor,  # [n, N, 3] farthest-point order, dense
+) -> None:
+    """Find out how far predictions can be trusted."""
+    module.confidence.learn(*look_twice(module, clouds))

@@ -1,0 +1,118 @@
+"""What shipped weights learn after their training, taught anew: the lessons that have grown since, and the card.
+
+A training is an hour, and what it leaves stays good while what decides and measures afterwards (`training.module`'s
+`LESSONS`) gets better. So lessons are taught again, by the weights' own training clouds and without labels; the test
+objects of the card are tested anew. What is finished stays if it is killed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shlex
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+from articulate_ssl.inference.checkpoint_file import CheckpointError
+from articulate_ssl.pretrained.check import data_of, tested
+from articulate_ssl.pretrained.pack import weaknesses
+from articulate_ssl.pretrained.rebuild import commit_of
+from articulate_ssl.pretrained.stages import Stage, Workplace
+from articulate_ssl.training.checkpoint import load_module
+from articulate_ssl.training.module import LESSONS
+from articulate_ssl.training.set_clouds import SetClouds
+from articulate_ssl.training.shipped_weights import WEIGHTS_FOLDER, ShippedWeights
+from articulate_ssl.training.weights_card import CARD_SUFFIX, WeightsCard
+from articulate_ssl.training.weights_file import write_weights
+from datamodules.atomic import atomic_write
+
+
+@dataclass(frozen=True)
+class Teaching:
+    """Lessons for one set of weights.
+
+    Attributes:
+        weights: Which.
+        lessons: Of `LESSONS`.
+        build: Folder for data, logs, and what is finished.
+        folder: Where weights and card go in the end.
+    """
+
+    weights: ShippedWeights
+    lessons: tuple[str, ...]
+    build: Path
+    folder: Path = WEIGHTS_FOLDER
+
+    def __post_init__(self) -> None:
+        """Raises: CheckpointError for a lesson that there is not."""
+        if unknown := sorted(set(self.lessons) - set(LESSONS)):
+            raise CheckpointError(f"{', '.join(unknown)}: no such lesson; there are {', '.join(LESSONS)}")
+
+    def run(self, say: Callable[[str], None]) -> WeightsCard:
+        """Teach, test, and write weights and card.
+
+        Raises:
+            CheckpointError: if the weights have no card.
+            StageFailed: if no data can be made.
+        """
+        card = WeightsCard.load(self.weights.file.with_suffix(CARD_SUFFIX))
+        root = self._make_data(card, say)
+        digest = hashlib.sha256(self.weights.file.read_bytes()).hexdigest()
+        done = self._done(digest)
+        module = load_module(self._taught if done else self.weights.file)
+        data = data_of(card, root, module.num_points)
+        for lesson in (lesson for lesson in LESSONS if lesson in self.lessons and lesson not in done):
+            say(f"{self.weights.name}: {lesson} …")
+            module.learn_what_predictions_are_worth(SetClouds(data), (lesson,))
+            write_weights(module, self._taught)
+            done.append(lesson)
+            with atomic_write(self._note) as file:
+                file.write(json.dumps({"of": digest, "done": done}).encode())
+        say(f"{self.weights.name}: test …")
+        module = load_module(self._taught)  # as others will read them
+        new = self._card(card, tested(module, data, self._place))
+        file = self.folder / self.weights.file.name
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_weights(module, file)
+        new.save(file.with_suffix(CARD_SUFFIX))
+        return new
+
+    def _make_data(self, card: WeightsCard, say: Callable[[str], None]) -> Path:
+        """As the card's command says."""
+        root, work = self._place / "data", Workplace(self.weights.name, self._place)
+        words = shlex.split(card.data["command"])[1:]  # `python` is this one
+        stage = Stage("data", (sys.executable, *words, "--workers", "1", "--out", str(root)))
+        if work.seconds(stage) is None:
+            work.run(stage, say)
+        return root
+
+    def _done(self, digest: str) -> list[str]:
+        """Lessons that the weights that lie here have had."""
+        note = json.loads(self._note.read_text()) if self._note.is_file() else {}
+        return note["done"] if note.get("of") == digest else []
+
+    def _card(self, card: WeightsCard, metrics: dict[str, Any]) -> WeightsCard:
+        taught = f"{', '.join(lesson for lesson in LESSONS if lesson in self.lessons)} by {commit_of(Path.cwd())}"
+        return replace(
+            card,
+            training=card.training | {"commit": f"{card.training['commit']}; {taught}"},
+            metrics={name: metrics[name] for name in card.metrics},
+            weaknesses=weaknesses(metrics, card.part_names, card.view),
+            date=date.today().isoformat(),
+        )
+
+    @property
+    def _place(self) -> Path:
+        return self.build / self.weights.name
+
+    @property
+    def _taught(self) -> Path:
+        return self._place / f"taught-{self.weights.file.name}"
+
+    @property
+    def _note(self) -> Path:
+        return self._place / "lessons.json"

@@ -1,0 +1,109 @@
+"""Shipped weights learn again what comes after training; their card says so, and what is finished is not repeated."""
+
+import json
+import shlex
+
+import pytest
+from packable import made_up_metrics
+from synthetic import write_synthetic_set
+from tiny import POINTS, fit, tiny_module
+
+from articulate_ssl.inference.checkpoint_file import CheckpointError
+from articulate_ssl.pretrained import stages
+from articulate_ssl.pretrained.teach import Teaching
+from articulate_ssl.training.checkpoint import load_module
+from articulate_ssl.training.module import LESSONS, ArticulatedPoseModule
+from articulate_ssl.training.shipped_weights import ShippedWeights
+from articulate_ssl.training.weights_card import WeightsCard
+from articulate_ssl.training.weights_file import write_weights
+
+COMMAND = "python -m render.generate --category laptop --seed 11 --train-instances 3"
+
+
+@pytest.fixture
+def shipped(tmp_path):
+    """Weights of a tiny module that was not taught, with a card."""
+    write_synthetic_set(tmp_path / "training")
+    network = tiny_module()
+    network.num_points = POINTS
+    fit(network, tmp_path / "training", 3)
+    weights = ShippedWeights("laptop", "complete", tmp_path / "laptop-complete.safetensors")
+    write_weights(network, weights.file)
+    WeightsCard(
+        category="laptop",
+        view="complete",
+        part_names=["base", "lid"],
+        data={"command": COMMAND, "seed": 11},
+        training={"command": "lightning fit", "commit": "abc"},
+        metrics={name: value for name, value in made_up_metrics().items() if name != "category"},
+        weaknesses=["none"],
+        date="2026-01-02",
+    ).save(tmp_path / "laptop-complete.json")
+    return weights
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """Commands of the data that were made."""
+    commands = []
+
+    def run(command, log, _lock, _tick):
+        log.write_text("")
+        commands.append(shlex.join(command))
+        write_synthetic_set(command[command.index("--out") + 1])
+        return 0
+
+    monkeypatch.setattr(stages, "run_program", run)
+    return commands
+
+
+@pytest.fixture
+def learnt(monkeypatch):
+    """Lessons that were taught."""
+    lessons = []
+    teach = ArticulatedPoseModule.learn_what_predictions_are_worth
+
+    def noted(self, clouds, some):
+        lessons.extend(some)
+        if "interrupt" in lessons:
+            raise KeyboardInterrupt
+        teach(self, clouds, some)
+
+    monkeypatch.setattr(ArticulatedPoseModule, "learn_what_predictions_are_worth", noted)
+    return lessons
+
+
+def test_lessons_are_taught_in_their_order_by_the_cards_data_and_tested(shipped, tmp_path, made, learnt):
+    out = tmp_path / "out"
+    before = shipped.file.read_bytes()
+    teaching = Teaching(shipped, ("confidence", "joint_limits"), tmp_path / "build", out)
+    card = teaching.run(print)
+    assert learnt == ["joint_limits", "confidence"]
+    assert made[0].split(" -m ", 1)[1].startswith(COMMAND.split(" -m ", 1)[1])
+    assert card.training["commit"].startswith("abc; joint_limits, confidence by ")
+    assert card.metrics["samples"] == 16 and card.metrics["r_err_deg"] != made_up_metrics()["r_err_deg"]
+    assert card.weaknesses != ["none"] and card == WeightsCard.load(out / "laptop-complete.json")
+    assert load_module(out / "laptop-complete.safetensors").confidence.learnt
+    assert shipped.file.read_bytes() == before
+
+
+def test_what_was_cut_off_goes_on_and_other_weights_begin_anew(shipped, tmp_path, made, learnt):
+    build = tmp_path / "build"
+    learnt.append("interrupt")
+    with pytest.raises(KeyboardInterrupt):
+        Teaching(shipped, LESSONS, build, tmp_path / "out").run(print)
+    learnt.clear()
+    Teaching(shipped, ("joint_limits",), build, tmp_path / "out").run(print)
+    Teaching(shipped, LESSONS, build, tmp_path / "out").run(print)
+    assert sorted(learnt) == sorted(LESSONS) and learnt[0] == "joint_limits" and len(made) == 1
+    note = json.loads((build / "laptop-complete" / "lessons.json").read_text())
+    assert sorted(note["done"]) == sorted(LESSONS)
+    learnt.clear()
+    write_weights(load_module(tmp_path / "out" / "laptop-complete.safetensors"), shipped.file)
+    Teaching(shipped, ("confidence",), build, tmp_path / "out").run(print)
+    assert learnt == ["confidence"]
+
+
+def test_lessons_that_there_are_not_are_named(shipped, tmp_path):
+    with pytest.raises(CheckpointError, match="astronomy: no such lesson; there are two_ways"):
+        Teaching(shipped, ("astronomy",), tmp_path)
