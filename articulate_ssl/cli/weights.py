@@ -43,7 +43,9 @@ def run(arguments: list[str]) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="articulate-ssl weights", description="Weights that come with the package.")
     commands = parser.add_subparsers(required=True, metavar="list|show|pack|rebuild|teach|check")
-    commands.add_parser("list", help="which there are, and what they are worth").set_defaults(do=_list)
+    listed = commands.add_parser("list", help="which there are, and what they are worth")
+    listed.add_argument("--markdown", choices=list(VIEWS), metavar="VIEW", help="README's table of one view instead")
+    listed.set_defaults(do=_list)
 
     show = commands.add_parser("show", help="print the card of one")
     show.add_argument("name", help="for example laptop-depth")
@@ -78,7 +80,13 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _list(_args: argparse.Namespace) -> int:
+def _list(args: argparse.Namespace) -> int:
+    if args.markdown:
+        from articulate_ssl.pretrained.markdown_table import as_markdown
+
+        cards = (WeightsCard.load(weights.file.with_suffix(CARD_SUFFIX)) for weights in shipped_weights())
+        print(as_markdown(cards, args.markdown), end="")
+        return 0
     headings = (Column(heading, no_wrap=True) for heading in ("weights", "MB", *_HEADINGS))
     # 80 columns hold no lines between them.
     table = Table(*headings, title="means over test clouds", box=None, pad_edge=False)
