@@ -41,15 +41,6 @@ class SurfaceDecision(SurfaceNetwork):
         self.right = nn.Linear(size.head_dim, 1)
         self.register_buffer("temperature", torch.tensor(1.0))
 
-    def odds(
-        self,
-        cloud: SurfaceCloud,  # of [B, N, 3]
-        frames: Tensor,  # [B, 2, 3, 3] frame -> camera
-    ) -> Tensor:  # [B]
-        """Logarithm of the odds that clouds look right in the first frame and not in the second."""
-        one, other = self.seen(cloud.seen_in(frames)).unflatten(0, (-1, 2)).unbind(1)
-        return one - other
-
     def seen(
         self,
         seen: SurfaceCloud,
@@ -63,13 +54,26 @@ class SurfaceDecision(SurfaceNetwork):
         frames: Tensor,  # [B, 2, 3, 3] of an explanation and of its twin -> camera
         dense: Tensor,  # [B, P, 3] farthest-point order
     ) -> Tensor:  # [B]
-        """`odds` of whole clouds, averaged over looks at different points."""
+        """Logarithm of the odds that clouds look right in the first frame and not in the second."""
+        one, other = self.looks_right(frames, dense).unbind(1)
+        return one - other
+
+    @torch.no_grad()
+    def looks_right(
+        self,
+        frames: Tensor,  # [B, S, 3, 3] -> camera
+        dense: Tensor,  # [B, P, 3] farthest-point order
+    ) -> Tensor:  # [B, S]
+        """How right whole clouds look in each frame, averaged over looks at different points."""
         looks = max(1, min(LOOKS, dense.shape[1] // self.size.read))
         points = dense[:, : looks * self.size.read]
         images, normal = spin_images(points, dense)
-        own = (slice(first, None, looks) for first in range(looks))
-        odds = [self.odds(SurfaceCloud.of(points[:, k], images[:, k], normal[:, k], self.size), frames) for k in own]
-        return torch.stack(odds).mean(dim=0)
+        found = []
+        for first in range(looks):
+            own = slice(first, None, looks)
+            cloud = SurfaceCloud.of(points[:, own], images[:, own], normal[:, own], self.size)
+            found.append(self.seen(cloud.seen_in(frames)).view(frames.shape[:2]))
+        return torch.stack(found).mean(dim=0)
 
 
 class WithSurface(nn.Module):

@@ -61,9 +61,9 @@ class Lessons:
     @torch.no_grad()
     def of(
         versions: Sequence[Tensor],  # of [n, P, 3] dense, farthest-point order
-        frames: Tensor,  # [n, 2, 3, 3]
+        frames: Tensor,  # [n, S, 3, 3]
     ) -> Lessons:
-        """From clouds and both their frames."""
+        """From clouds and all their frames."""
         count = _SHOWN * SIZE.read
         dense = torch.cat(list(versions))
         shown = announced(log, "surfaces of clouds that teach", dense.split(_CHUNK))
@@ -89,7 +89,7 @@ class Lessons:
 
 def learn_surface(
     versions: Sequence[Tensor],  # of [n, P, 3] dense, farthest-point order: clouds as they are first
-    frames: Tensor,  # [n, 2, 3, 3] -> camera, of the explanation that a teacher favours first
+    frames: Tensor,  # [n, S, 3, 3] -> camera, of the explanation that a teacher favours first
     order: Tensor,  # [m] clouds that the teacher knows something of: of those to be taught by first
     least: float,
 ) -> SurfaceDecision | None:
@@ -103,17 +103,18 @@ def learn_surface(
         log.info("no network decides: that takes %d clouds to teach it, there are %d", FEWEST, len(taught))
         return None
     decision = teach(Lessons.of([clouds[taught] for clouds in versions], frames[taught]))
-    said = [
-        decision.log_odds(*some)
-        for some in zip(frames[rest].split(_CHUNK), versions[0][rest].split(_CHUNK), strict=True)
-    ]
-    odds = torch.cat(said)
-    agrees = float((odds > 0).double().mean())
+    said = torch.cat(
+        [
+            decision.looks_right(*some)
+            for some in zip(frames[rest].split(_CHUNK), versions[0][rest].split(_CHUNK), strict=True)
+        ]
+    )
+    agrees = float((said.argmax(dim=1) == 0).double().mean())
     log.info("a network taught by %d clouds says of %.0f %% of the others what taught it", len(taught), 100 * agrees)
     if agrees < least:
         log.warning("that is too few: no network decides")
         return None
-    decision.temperature.copy_(believable(odds))
+    decision.temperature.copy_(believable(said[:, 0] - said[:, 1:].logsumexp(dim=1)))
     return decision
 
 
