@@ -377,14 +377,16 @@ class PoseEstimator:
     ) -> tuple[Hypotheses, Hypotheses, Tensor, Tensor | None]:  # H = 1, H = 1, [B], [B, N, K]
         """The category's shape where the search for sliding parts finds it, and its rival.
 
-        Which way round clouds are, the search decides. With `num_points` the network's hypotheses that are turned
-        alike compete by their errors.
+        Which way round clouds are, the search decides; with `num_points` by a network, if that was taught, and the
+        network's hypotheses that are turned alike compete by their errors.
 
         Returns:
             Both, the margin between them, and which parts labelled clouds say that points are of, if there are any.
         """
-        shape, base, state, cost, votes = self.sliding.search(self.articulated.category.chain(), dense, points)
-        clouds, count = cost.shape
+        decides = num_points is not None
+        slid = self.sliding.search(self.articulated.category.chain(), dense, points, decides)
+        shape, base, state, margin, votes = slid
+        clouds, count = base.shape[:2]
         rows, parts = torch.arange(clouds, device=points.device), shape.points.unflatten(1, (shape.num_parts, -1))
 
         def select(index: Tensor) -> Hypotheses:
@@ -396,8 +398,7 @@ class PoseEstimator:
             return replace(found, shape=CanonicalShape(parts[own] - center[:, :, None], center), structure=structure)
 
         first, rival = select(torch.zeros_like(rows)), select(torch.ones_like(rows))
-        margin = (1 - cost[:, 0] / cost[:, 1]).clamp(0, 1)
-        if num_points is None:
+        if not decides:
             return first, rival, margin, votes
         error = chamfer_l1(points, first.posed()[:, 0].flatten(1, 2), self.observation.bidirectional)
         others = self._candidates(points, num_points, registers=True)

@@ -4,6 +4,7 @@ Chests are boxes: every cloud shows its Manhattan frame, but not which of its 24
 chest is right about that too rarely. Discovery has settled it for a whole collection (`discovery.synchronization`); so
 a new cloud is turned as it is most like some clouds of those chests, or copies of them in other proportions, all
 stretched to one box. That decides: a shape that is placed in the cloud, and stretched, fits about as well upside down.
+It also teaches a network that sees the surface (`training.turn_lessons`), which then chooses among the likeliest turns.
 Where whole objects were discovered, clouds of theirs that are most like the new one, or copies in other proportions and
 joint states, say which part its points are of, and the shape's parts fill their boxes; else parts are placed by what
 every offset costs.
@@ -15,7 +16,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from articulate_ssl.discovery.distance_field import DistanceFields
 from articulate_ssl.discovery.instance_fit import InstanceFit
@@ -29,6 +30,7 @@ from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.screw import PRISMATIC
 from articulate_ssl.geometry.se3 import se3
+from articulate_ssl.inference.surface_decision import WithSurface
 from articulate_ssl.ops.few_bytes import from_few_bytes, in_few_bytes
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.joints import Joints
@@ -39,6 +41,7 @@ _GALLERY, _GALLERY_POINTS = 128, 128  # clouds, and points of each; twice as man
 _LABELLED_POINTS = 512
 _PROPORTIONS = 4  # copies of every cloud by which turns are decided: wrong 9 % without, 6 % with 4 or 8
 _TURNS = 2  # the likeliest, and its rival
+_LEADING = 4  # turns among which a network chooses, if one was taught
 _FITTED_POINTS = 1024  # of a cloud, to which the shape is fitted
 _PLACED_POINTS = 256  # of the shape, whose offsets are tried
 _CYCLES = 4  # of the descent on every candidate; twice as many on the best
@@ -51,18 +54,18 @@ class Slid(NamedTuple):
         shape: Of 2 B candidates, stretched to the clouds' proportions (points [2 B, K M, 3]).
         base: [B, 2, 4, 4]
         state: [B, 2, J]
-        cost: [B, 2] how far the clouds of the gallery most alike are.
+        margin: [B] how much likelier than the other the likelier turn is.
         votes: [B, M, K] share of the labelled clouds most alike in which a point is of each part, if there are any.
     """
 
     shape: ArticulatedShape
     base: Tensor
     state: Tensor
-    cost: Tensor
+    margin: Tensor
     votes: Tensor | None
 
 
-class SlidingSearch(nn.Module):
+class SlidingSearch(WithSurface):
     """Poses and joint states of an articulated shape whose parts slide, in clouds of any orientation.
 
     It computes on the CPU, wherever its buffers are, because distance fields do.
@@ -74,6 +77,7 @@ class SlidingSearch(nn.Module):
         part: [r, P] uint8, which part their points are of.
         points: [K, M, 3] the shape in canonical object space, whose axes are the clouds' common frame.
         axis, pivot: [J, 3] its joints; limits: [J, 2] of their states.
+        surface: Which of the leading turns looks right, if that was taught.
     """
 
     def __init__(self, num_parts: int, shape_points: int) -> None:
@@ -119,8 +123,28 @@ class SlidingSearch(nn.Module):
     def turns(
         self,
         clouds: Tensor,  # [B, N, 3] with all their points, on the CPU
-    ) -> tuple[Tensor, Tensor]:  # [B, 2, 3, 3], [B, 2]
-        """Rotations cloud -> canonical orientation, the likeliest two, and how far the clouds most alike then are."""
+        decides: bool = True,
+    ) -> tuple[Tensor, Tensor]:  # [B, 2, 3, 3], [B]
+        """Rotations cloud -> canonical orientation, the likeliest two, and how much likelier the first is.
+
+        Args:
+            decides: The network has a say, if there is one.
+        """
+        turn, cost = self.leading_turns(clouds)
+        if not decides or self.surface is None:
+            return turn[:, :_TURNS], (1 - cost[:, 0] / cost[:, 1]).clamp(0, 1)
+        where = self.surface.temperature.device
+        odds = self.surface.looks_right(turn.mT.to(where), clouds.to(where))
+        best, index = odds.topk(_TURNS, dim=1)
+        rows = torch.arange(len(turn))[:, None]
+        return turn[rows, index.cpu()], ((best[:, 0] - best[:, 1]) / (2 * self.surface.temperature)).tanh().cpu()
+
+    @torch.no_grad()
+    def leading_turns(
+        self,
+        clouds: Tensor,  # [B, N, 3] with all their points, on the CPU
+    ) -> tuple[Tensor, Tensor]:  # [B, C, 3, 3], [B, C]
+        """Rotations cloud -> canonical orientation, the likeliest first, and how far the clouds most alike then are."""
         rotation, _ = manhattan_frames(clouds, torch.Generator().manual_seed(0))
         boxes, _, _ = unit_boxes(clouds @ rotation.mT)
         group = rotation_group(24).elements.to(clouds)
@@ -131,7 +155,7 @@ class SlidingSearch(nn.Module):
         for box, frame in zip(boxes, rotation, strict=True):
             cost = DistanceFields.of(box[None]).at(0, turned).clamp(max=CAP).mean(dim=2)  # [G, R]
             alike = cost.topk(min(NEIGHBOURS, len(gallery)), dim=1, largest=False).values
-            least = alike.mean(dim=1).topk(_TURNS, largest=False)
+            least = alike.mean(dim=1).topk(_LEADING, largest=False)
             found.append(group[least.indices] @ frame)
             costs.append(least.values)
         return torch.stack(found), torch.stack(costs)
@@ -143,10 +167,11 @@ class SlidingSearch(nn.Module):
         chain: KinematicChain,
         clouds: Tensor,  # [B, N, 3] with all their points
         points: Tensor,  # [B, M, 3] of the same clouds, whose parts are asked for
+        decides: bool = True,
     ) -> Slid:
-        """The shape in every cloud, in each of two turns, the likelier first."""
+        """The shape in every cloud, in each of two turns, the likelier first (`turns`)."""
         device, clouds, points = clouds.device, clouds.cpu().clone(), points.cpu().clone()  # no inference tensors
-        turn, cost = self.turns(clouds)
+        turn, margin = self.turns(clouds, decides)
         copies = torch.einsum("bcij,bnj->bcni", turn, clouds).flatten(0, 1)
         points = torch.einsum("bcij,bmj->bcmi", turn, points).flatten(0, 1)
         fit, votes = self._fitted(self._shape(chain), copies, points)
@@ -157,7 +182,7 @@ class SlidingSearch(nn.Module):
         lines = {name: getattr(joints, name).to(device) for name in ("axis", "pivot", "limits")}
         found = ArticulatedShape(found.points.to(device), found.label.to(device), replace(joints, **lines))
         votes = None if votes is None else votes.to(device)
-        return Slid(found, back.to(device) @ base, state, cost.to(device), votes)
+        return Slid(found, back.to(device) @ base, state, margin.to(device), votes)
 
     def _fitted(
         self,
@@ -194,7 +219,7 @@ class SlidingSearch(nn.Module):
 
     def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
         """Galleries have any size; weights from before there was a search have none."""
-        for name, own in list(self.named_buffers()):
+        for name, own in list(self.named_buffers(recurse=False)):
             value = state_dict.setdefault(prefix + name, own.clone())
             setattr(self, name, torch.empty_like(value, dtype=own.dtype, device=own.device))
         super()._load_from_state_dict(state_dict, prefix, *rest)

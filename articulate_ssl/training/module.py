@@ -47,13 +47,14 @@ from articulate_ssl.training.schedule import ScheduleOptions
 from articulate_ssl.training.self_agreement import LearnConfidence, learn_confidence
 from articulate_ssl.training.set_clouds import SetClouds
 from articulate_ssl.training.test_report import TestReport
+from articulate_ssl.training.turn_lessons import learn_turns
 from datamodules.articulated_dataset import split_labels
 
 log = logging.getLogger(__name__)
 
 JOINT_TYPES = {"revolute": REVOLUTE, "prismatic": PRISMATIC}
 # What is learnt after the last step, in this order: each reads what those before it have learnt.
-LESSONS = ("two_ways", "handedness", "part_frames", "hinge_sides", "joint_limits", "confidence")
+LESSONS = ("two_ways", "turns", "handedness", "part_frames", "hinge_sides", "joint_limits", "confidence")
 # Terms of the loss, by the names that they are logged under.
 _LOGGED = {
     "loss": "loss",
@@ -83,8 +84,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         calibration_samples: Training clouds on which `lightning test` relates slots and canonical spaces to labels, and
             from which joint limits (`inference.state_range`) and confidence are learnt without them.
         two_ways_samples: Training clouds from which the decision between two explanations is learnt, of those that fit
-            alike (`inference.two_ways`) or of predictions and their rivals (`inference.surface_decision`); 0 learns
-            none.
+            alike (`inference.two_ways`), of predictions and their rivals (`inference.surface_decision`), or of the
+            turns that a collection says (`inference.sliding_search`); 0 learns none.
         handedness_samples: Training clouds of an upright camera from which it is learnt whether some objects are mirror
             images of the others (`inference.handedness`); 0 learns nothing of it.
         part_frames_samples: Training clouds from which it is learnt which parts have faces that say how they are
@@ -212,6 +213,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         calibration = self.calibration_samples
         plan = {
             "two_ways": (learn_two_ways, self.two_ways_samples if decides else 0),
+            "turns": (learn_turns, self.two_ways_samples if refines and any_way and self.sliding.learnt else 0),
             "handedness": (learn_handedness, 0 if any_way else self.handedness_samples),
             "part_frames": (learn_part_frames, self.part_frames_samples if refines and turns else 0),
             "hinge_sides": (learn_hinge_sides, self.hinge_sides_samples if refines and any_way else 0),
@@ -234,7 +236,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         """Adam; the category's shapes and joints are a group of their own."""
         shared = list(self.articulated.category.parameters())
         # What is learnt after the last step is not trained with the rest, nor when a run that ended goes on.
-        elsewhere = set(map(id, (*shared, *self.two_ways.parameters(), *self.hinge_sides.parameters())))
+        taught = (self.two_ways, self.hinge_sides, self.sliding)
+        elsewhere = set(map(id, (*shared, *(parameter for some in taught for parameter in some.parameters()))))
         others = [p for p in self.parameters() if id(p) not in elsewhere]
         optimizer = torch.optim.Adam(
             [{"params": others}, {"params": shared}], lr=self.schedule.learning_rate, betas=(0.9, 0.999), eps=1e-8

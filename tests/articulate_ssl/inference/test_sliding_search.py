@@ -15,8 +15,10 @@ from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.inference.pose_estimation import PoseEstimator
 from articulate_ssl.inference.scan_scales import predict_scans
 from articulate_ssl.inference.sliding_search import SlidingSearch
+from articulate_ssl.inference.surface_decision import SurfaceDecision
 from articulate_ssl.network.articulated_network import ArticulatedNetwork
 from articulate_ssl.network.options import NetworkOptions
+from articulate_ssl.network.surface_network import SurfaceSize
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.joints import Joints
 from articulate_ssl.shape.observation import Observation
@@ -51,12 +53,12 @@ def test_unseen_chests_of_other_proportions_are_found(learnt):
     proportion = torch.tensor([1.15, 0.85, 1.0])
     standing = transform_points(torch.linalg.inv(data.base), data.points) * proportion
     points = transform_points(data.base, standing)
-    shape, base, state, cost, votes = learnt.search(CHAIN, points, points)
+    shape, base, state, margin, votes = learnt.search(CHAIN, points, points)
     assert votes is None  # no cloud has labels
     truth = data.base[:, None, :3, :3].expand(-1, 2, -1, -1)
     angle = roma.rotmat_geodesic_distance(base[..., :3, :3], truth).rad2deg()
     assert angle[:, 0].max() < 5 and angle[:, 1].min() > 80
-    assert (cost[:, 0] < cost[:, 1]).all()
+    assert (margin > 0).all() and (margin < 1).all()
     assert (state[:, 0] - proportion[0] * data.state).abs().median() < 0.03
     posed = shape.posed(base.flatten(0, 1), state.flatten(0, 1)).unflatten(0, (4, 2))
     first, second = (chamfer_l1(points[:, :512], posed[:, turn]) for turn in (0, 1))
@@ -70,6 +72,43 @@ def test_a_gallery_that_was_turned_over_turns_predictions_over(learnt):
     other.load_state_dict(learnt.state_dict())
     other.gallery = learnt.gallery @ over
     torch.testing.assert_close(other.turns(data.points)[0][:, 0], over @ learnt.turns(data.points)[0][:, 0])
+
+
+class _Upright(SurfaceDecision):
+    """Stands in for a network: an object looks right where the camera's z points along an axis of it."""
+
+    def __init__(self, axis: int) -> None:
+        super().__init__()
+        self.axis = axis
+
+    def looks_right(self, frames, dense):
+        return 4 * frames[..., 2, self.axis]
+
+
+def test_a_network_chooses_among_the_leading_turns_and_says_how_sure_it_is(learnt):
+    data = _chests(3, seed=2)
+    search = SlidingSearch(3, 200)
+    search.load_state_dict(learnt.state_dict())
+    leading, _ = search.leading_turns(data.points)
+    search.surface = _Upright(axis=1)
+    turn, margin = search.turns(data.points)
+    said = leading.mT[..., 2, 1]
+    best, index = said.max(dim=1)
+    torch.testing.assert_close(turn[:, 0], leading[torch.arange(3), index])
+    torch.testing.assert_close(margin, (2 * (best - said.topk(2).values[:, 1])).tanh())
+    # A search without a network asks none.
+    assert torch.equal(search.turns(data.points, decides=False)[0], learnt.turns(data.points)[0])
+    found = search.search(CHAIN, data.points, data.points).base[:, 0, :3, :3]
+    other = search.search(CHAIN, data.points, data.points, decides=False).base[:, 0, :3, :3]
+    assert roma.rotmat_geodesic_distance(found, turn[:, 0].mT).max() < 0.1
+    assert roma.rotmat_geodesic_distance(other, leading[:, 0].mT).max() < 0.1
+    # It is kept with the weights.
+    search.surface = SurfaceDecision(SurfaceSize(read=128, centers=64))
+    again = SlidingSearch(3, 200)
+    again.load_state_dict(search.state_dict())
+    assert again.surface.size.read == 128
+    again.load_state_dict(learnt.state_dict())
+    assert again.surface is None
 
 
 def test_clouds_do_not_interact_and_the_gallery_is_saved(learnt):

@@ -37,6 +37,16 @@ def test_the_network_decides_clouds_that_it_never_saw():
     assert (decision.log_odds(frames, clouds) > 0).double().mean() > 0.9
 
 
+def test_of_several_frames_it_finds_the_right_one():
+    clouds, frames = wedges(160, 0)
+    quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    several = torch.cat([frames, frames @ quarter], dim=1)  # of four ways, the first is right
+    decision = learn_surface([clouds], several, torch.arange(160), 0.6)
+    clouds, frames = wedges(60, 7)
+    several = torch.cat([frames, frames @ quarter], dim=1).flip(1)
+    assert (decision.looks_right(several, clouds).argmax(dim=1) == 3).double().mean() > 0.8
+
+
 def test_it_knows_more_than_a_teacher_that_is_sometimes_wrong():
     clouds, frames = wedges(200, 0)
     wrong = torch.rand(200, generator=torch.Generator().manual_seed(1)) < 0.1
