@@ -90,11 +90,15 @@ class FinalFit:
         margin: Tensor,  # [B]
         points: Tensor,  # [B, N, 3]
         dense: Tensor | None,  # [B, P, 3]
+        turns: bool = True,
     ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
         """Explanations in the clouds' proportions; those whose joints are where none was seen give way to others.
 
         These are the same from other joint states, rivals, and what a search finds with the category's shape, if they
         are within what was seen and explain a cloud about as well. Nothing is sure then, so the margin is 0.
+
+        Args:
+            turns: Others may be turned another way. Simulated views know better which way round an object is.
         """
         fitted = self.in_proportion(one, points, dense)
         out = (~self._within(fitted)).nonzero()[:, 0]
@@ -102,7 +106,8 @@ class FinalFit:
             return fitted, rival, margin
         own, seen, before = points[out], None if dense is None else dense[out], one.rows(out)
         least = _ABOUT_AS_WELL * self.distance(fitted, points)[out]
-        for start, same in ((before, True), (rival.rows(out), False), (self._searched(own), False)):
+        others = ((rival.rows(out), False), (self._searched(own), False)) if turns else ()
+        for start, same in ((before, True), *others):
             tried = self.in_proportion(self.registration.freed(start, own), own, seen)
             error = self.distance(tried, own)
             better = (self._within(tried) & (error < least)).nonzero()[:, 0]

@@ -224,7 +224,8 @@ class PoseEstimator:
             chosen, other, margin, votes = self._chosen(points, num_points, registers, dense)
             error = self.final.distance(chosen, points)
             if registers and fits:
-                chosen, other, margin = self.final.within_limits(chosen, other, margin, points, dense)
+                turns = not self.view_search.learnt
+                chosen, other, margin = self.final.within_limits(chosen, other, margin, points, dense, turns)
             rival = self._packaged(other, points, torch.zeros_like(margin))
             return self._packaged(chosen, points, margin, votes), rival, error
 
@@ -491,7 +492,8 @@ class PoseEstimator:
         votes: Tensor | None = None,  # [B, N, K]
     ) -> tuple[Prediction, Tensor]:
         """Explanations in the clouds' proportions, packaged; and their errors [B] before that."""
-        shown, _, margin = self.final.within_limits(one, rival, margin, points, dense)
+        turns = not self.view_search.learnt
+        shown, _, margin = self.final.within_limits(one, rival, margin, points, dense, turns)
         return self._packaged(shown, points, margin, votes), self.final.distance(one, points)
 
     def _packaged(

@@ -92,11 +92,14 @@ def test_a_rival_within_limits_takes_the_place_of_what_is_not(final, data, monke
     shown, other, margin = final.within_limits(start, rival, torch.ones(4), data.points, None)
     torch.testing.assert_close(shown.state[:, 0], data.state, atol=0.1, rtol=0)
     assert torch.equal(other.state, start.state) and (margin == 0).all()
+    # Unless it was known which way round the object is.
+    kept, other, margin = final.within_limits(start, rival, torch.ones(4), data.points, None, turns=False)
+    assert torch.equal(kept.state, final.in_proportion(start, data.points, None).state)
+    assert other is rival and (margin == 1).all()
 
 
 def test_what_nothing_within_limits_explains_stays(final, data):
-    # Ovens that are open farther than any that was seen: nearly closed ones do not explain them.
-    data = data._replace(state=data.state)
+    # Ovens that are open farther than any that was seen: others do not explain them.
     _limits(final, -2.5, -1.5)
     start = _at(final, data, data.state)
     shown, _, margin = final.within_limits(start, start, torch.ones(4), data.points, None)
