@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from articulate_ssl.inference.checkpoint_file import CheckpointError
+from articulate_ssl.ops.progress import shown
 from articulate_ssl.pretrained.check import data_of, tested
 from articulate_ssl.pretrained.pack import weaknesses
 from articulate_ssl.pretrained.rebuild import commit_of
@@ -67,7 +68,8 @@ class Teaching:
         data = data_of(card, root, module.num_points)
         for lesson in (lesson for lesson in LESSONS if lesson in self.lessons and lesson not in done):
             say(f"{self.weights.name}: {lesson} …")
-            module.learn_what_predictions_are_worth(SetClouds(data), (lesson,))
+            with shown():
+                module.learn_what_predictions_are_worth(SetClouds(data), (lesson,))
             write_weights(module, self._taught)
             done.append(lesson)
             with atomic_write(self._note) as file:
