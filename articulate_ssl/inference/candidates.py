@@ -112,11 +112,13 @@ class Candidates:
     Attributes:
         error: [B, C] of each.
         base: [B, C, 4, 4] base poses.
+        state: [B, C, J] joint states.
         select: One of each cloud, by its index [B], as H = 1.
     """
 
     error: Tensor
     base: Tensor
+    state: Tensor
     select: Callable[[Tensor], Hypotheses]
 
 

@@ -26,7 +26,7 @@ from articulate_ssl.ops.chamfer import chamfer
 
 # How much larger the error of what is within the joints' limits may be. Of ovens that were explained by a door beyond
 # them, the right explanation's was up to 1.23 times the other's (docs/experiments.md, step 144). Chosen.
-_ABOUT_AS_WELL = 1.3
+ABOUT_AS_WELL = 1.3
 
 
 class FinalFit:
@@ -105,7 +105,7 @@ class FinalFit:
         if not (self.fits and len(out)):
             return fitted, rival, margin
         own, seen, before = points[out], None if dense is None else dense[out], one.rows(out)
-        least = _ABOUT_AS_WELL * self.distance(fitted, points)[out]
+        least = ABOUT_AS_WELL * self.distance(fitted, points)[out]
         others = ((rival.rows(out), False), (self._searched(own), False)) if turns else ()
         for start, same in ((before, True), *others):
             tried = self.in_proportion(self.registration.freed(start, own), own, seen)
@@ -138,14 +138,12 @@ class FinalFit:
         shape = self.articulated.category.articulated_shape(self.articulated.joint_type)
         starts = self.registration.states.starts().to(points)
         base, state, error = search_articulated(shape, points, rotations, starts)
-        return Candidates(error, base, self.articulated.category_at(base, state).select)
+        return Candidates(error, base, state, self.articulated.category_at(base, state).select)
 
     def _searched(self, points: Tensor) -> Hypotheses:
         """The best that is found within the joints' limits, H = 1."""
         found = self.search(points)
-        every = torch.arange(found.error.shape[1], device=points.device).expand(len(points), -1)
-        state = found.select(every).state
-        allowed = self.registration.states.contains(state.flatten(0, 1)).view_as(found.error)
+        allowed = self.registration.states.contains(found.state)
         turned = self.registration.observation.orientation.contains(found.base[..., :3, :3])
         return found.select(found.error.masked_fill(~(allowed & turned), torch.inf).argmin(dim=1))
 

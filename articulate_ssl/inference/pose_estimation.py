@@ -43,7 +43,7 @@ from articulate_ssl.inference.candidates import (
     rivals,
 )
 from articulate_ssl.inference.common_shape import CommonShape
-from articulate_ssl.inference.final_fit import FinalFit
+from articulate_ssl.inference.final_fit import ABOUT_AS_WELL, FinalFit
 from articulate_ssl.inference.handedness import Handedness, in_the_mirror
 from articulate_ssl.inference.hinge_sides import HingeSides
 from articulate_ssl.inference.hypothesis_registration import HypothesisRegistration
@@ -64,6 +64,9 @@ from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.network.rigid_alignment import RigidAlignment
 from articulate_ssl.ops.chamfer import hypothesis_distances
 from articulate_ssl.shape.observation import Observation
+
+# Of the width of a joint's range: registration, before proportions, leaves doors 10 degrees off and more. Chosen.
+_WELL_BEYOND = 0.15
 
 
 class PoseEstimator:
@@ -326,11 +329,15 @@ class PoseEstimator:
         return chosen, other, torch.where(alone, margin, decided)
 
     def _best(self, candidates: Candidates) -> tuple[Hypotheses, Hypotheses, Tensor]:
-        """The best candidate of every cloud, its rival, and the margin between them [B]."""
-        rotation = candidates.base[..., :3, :3]
-        best = self.observation.ranked(candidates.error, rotation).argmin(dim=1)
+        """The best candidate of every cloud, its rival, and the margin between them [B].
+
+        Errors of those whose joints are well beyond their limits count more, by as much as `FinalFit` lets them.
+        """
+        rotation, likely = candidates.base[..., :3, :3], self.states.contains(candidates.state, _WELL_BEYOND)
+        error = torch.where(likely, candidates.error, ABOUT_AS_WELL * candidates.error)
+        best = self.observation.ranked(error, rotation).argmin(dim=1)
         allowed = self.observation.orientation.contains(rotation)
-        rival, margin = rivals(candidates.error, candidates.base, best, allowed)
+        rival, margin = rivals(error, candidates.base, best, allowed)
         return candidates.select(best), candidates.select(rival), margin
 
     @torch.no_grad()
@@ -368,7 +375,7 @@ class PoseEstimator:
         else:
             candidates, error = last.hypotheses, last.distance
         candidates = candidates.at(pose[:, None] @ candidates.base, candidates.state)
-        return Candidates(error, candidates.base, candidates.select)
+        return Candidates(error, candidates.base, candidates.state, candidates.select)
 
     def _slid(
         self,

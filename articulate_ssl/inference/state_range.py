@@ -7,9 +7,6 @@ from torch import Tensor, nn
 
 _RANGE_WEIGHT = 0.02  # of a batch
 _SIDE = 1 / 3  # of the width of a joint's range, from its middle
-# Share of the states at either end that do not count, as some predictions are wrong. States are taken for spread
-# evenly, so the range is wider by as much.
-_LEFT_OUT = 0.05
 _SLACK = 0.05  # of the width of a joint's range, beyond it: some degrees, which predictions are off by. Chosen.
 
 
@@ -46,24 +43,34 @@ class StateRange(nn.Module):
 
     def learn(
         self,
-        state: Tensor,  # [n, J] of predictions of training clouds, of which a few may be wrong
+        state: Tensor,  # [n, J] of predictions of training clouds, of which some may be wrong
+        width: float,
     ) -> None:
-        """Take over which states there are."""
-        ends = torch.tensor([_LEFT_OUT, 1 - _LEFT_OUT]).to(state)
-        low, high = state.quantile(ends, dim=0)
-        more = (high - low) * _LEFT_OUT / (1 - 2 * _LEFT_OUT)
-        self.seen.copy_(torch.stack([low - more, high + more], dim=-1))
+        """Take over which states there are: of each joint the range of that width in which most are.
+
+        What is explained wrongly, each object in the same way, may be beyond it in many clouds: an oven's door that is
+        taken for its bottom's is open by as much more as its own is by less.
+        """
+        for joint, own in enumerate(state.T):
+            inside = ((own >= own[:, None]) & (own <= own[:, None] + width)).sum(dim=1)
+            low = own[inside == inside.max()].mean()
+            self.seen[joint] = torch.stack([low, low + width])
 
     def contains(
         self,
-        state: Tensor,  # [B, J]
-    ) -> Tensor:  # [B] bool
-        """Whether all joints are within what is known, or about; everything, until it is."""
+        state: Tensor,  # [..., J]
+        slack: float = _SLACK,
+    ) -> Tensor:  # [...] bool
+        """Whether all joints are within what is known, or about; everything, until it is.
+
+        Args:
+            slack: How far beyond it counts, of the width of a joint's range.
+        """
         if not self.learnt:
-            return torch.ones_like(state[:, 0], dtype=torch.bool)
+            return torch.ones_like(state[..., 0], dtype=torch.bool)
         low, high = self.seen.unbind(-1)
-        slack = _SLACK * (high - low)
-        return ((state >= low - slack) & (state <= high + slack)).all(dim=1)
+        more = slack * (high - low)
+        return ((state >= low - more) & (state <= high + more)).all(dim=-1)
 
     def starts(self) -> Tensor:  # [1 + 2^J, J]
         """Where to start looking for joint states: the middle of the range, and in every combination either side."""

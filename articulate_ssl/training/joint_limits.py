@@ -25,7 +25,10 @@ def learn_joint_limits(
     module: ArticulatedPoseModule,
     clouds: Tensor,  # [n, N, 3] farthest-point order, dense
 ) -> None:
-    """Find out which joint states there are, where parts turn and predictions take clouds' proportions."""
+    """Find out which joint states there are, where parts turn and predictions take clouds' proportions.
+
+    How wide a joint's range is, the configuration says (`state_range`), and where it lies, most predictions.
+    """
     estimator, states, sides = module.estimator, module.states, module.hinge_sides
     states.forget()  # of a run that ended and goes on
     if not estimator.final.fits or not module.inference.refine or len(clouds) < FEWEST:
@@ -34,4 +37,4 @@ def learn_joint_limits(
     for some in announced(log, "joint limits", clouds.split(_BATCH)):
         prediction = estimator.predict(some[:, : registered_points(module)], module.num_points, dense=some)
         found.append(prediction.joint_state + sides.closed * sides.learnt)
-    states.learn(torch.cat(found))
+    states.learn(torch.cat(found), module.hparams["state_range"])

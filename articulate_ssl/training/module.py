@@ -53,8 +53,12 @@ from datamodules.articulated_dataset import split_labels
 log = logging.getLogger(__name__)
 
 JOINT_TYPES = {"revolute": REVOLUTE, "prismatic": PRISMATIC}
-# What is learnt after the last step, in this order: each reads what those before it have learnt.
-LESSONS = ("two_ways", "turns", "handedness", "part_frames", "hinge_sides", "joint_limits", "confidence")
+# What is learnt after the last step, in this order: each reads what those before it have learnt. Joint limits come
+# first, as what is explained beyond them must not teach, and again when it is known how faces lie: that moves states.
+LESSONS = (
+    *("first_limits", "two_ways", "turns", "handedness", "part_frames", "hinge_sides", "joint_limits"),
+    "confidence",
+)
 # Terms of the loss, by the names that they are logged under.
 _LOGGED = {
     "loss": "loss",
@@ -211,13 +215,15 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         # Where the frames of the collection have said which way round clouds are, nothing is left to decide.
         decides = refines and any_way and not self.sliding.learnt
         calibration = self.calibration_samples
+        limits = learn_joint_limits, calibration if refines and turns else 0
         plan = {
+            "first_limits": limits,
             "two_ways": (learn_two_ways, self.two_ways_samples if decides else 0),
             "turns": (learn_turns, self.two_ways_samples if refines and any_way and self.sliding.learnt else 0),
             "handedness": (learn_handedness, 0 if any_way else self.handedness_samples),
             "part_frames": (learn_part_frames, self.part_frames_samples if refines and turns else 0),
             "hinge_sides": (learn_hinge_sides, self.hinge_sides_samples if refines and any_way else 0),
-            "joint_limits": (learn_joint_limits, calibration if refines and turns else 0),
+            "joint_limits": limits,
             "confidence": (learn_confidence, calibration),
         }
         for lesson in LESSONS:

@@ -9,6 +9,7 @@ from articulated_objects import OVEN, clouds, true_shape
 from tiny import POINTS, tiny_module
 
 from articulate_ssl.geometry.screw import PRISMATIC
+from articulate_ssl.inference.candidates import Candidates
 from articulate_ssl.inference.common_shape import CommonShape
 from articulate_ssl.inference.final_fit import FinalFit
 from articulate_ssl.inference.hypothesis_registration import HypothesisRegistration
@@ -156,3 +157,18 @@ def test_objects_in_turned_frames_are_hinged_as_most_are_if_that_fits_better(mon
     monkeypatch.setattr(estimator.registration, "freed", lambda one, _points: one)
     estimator.states.seen.copy_(torch.tensor([[5.0, 6.0]]))
     assert torch.equal(estimator._as_most_are(turned, quarters, points, points).reconstruction_error, error)
+
+
+def test_candidates_well_beyond_joint_limits_must_fit_much_better_to_be_chosen():
+    estimator = tiny_module().eval().estimator
+    turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))
+    base = torch.stack([torch.eye(4), turn]).expand(4, 2, 4, 4)
+    error = torch.tensor([[0.10, 0.12], [0.10, 0.14], [0.10, 0.12], [0.10, 0.12]])
+    # Well beyond the limits; the same, much better; about within; the other is beyond, too.
+    state = torch.tensor([[[1.5], [0.5]], [[1.5], [0.5]], [[1.1], [0.5]], [[1.5], [-0.5]]])
+    candidates = Candidates(error, base, state, lambda index: index)
+    assert estimator._best(candidates)[0].tolist() == [0, 0, 0, 0]
+    estimator.states.seen.copy_(torch.tensor([[0.0, 1.0]]))
+    best, rival, margin = estimator._best(candidates)
+    assert best.tolist() == [1, 0, 0, 0] and (best + rival == 1).all()
+    torch.testing.assert_close(margin, 1 - torch.tensor([0.12 / 0.13, 0.13 / 0.14, 0.10 / 0.12, 0.10 / 0.12]))

@@ -105,5 +105,5 @@ def test_what_was_cut_off_goes_on_and_other_weights_begin_anew(shipped, tmp_path
 
 
 def test_lessons_that_there_are_not_are_named(shipped, tmp_path):
-    with pytest.raises(CheckpointError, match="astronomy: no such lesson; there are two_ways"):
+    with pytest.raises(CheckpointError, match="astronomy: no such lesson; there are first_limits, two_ways"):
         Teaching(shipped, ("astronomy",), tmp_path)

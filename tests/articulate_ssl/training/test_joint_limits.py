@@ -21,7 +21,7 @@ def _module(**options):
 
 
 def test_they_are_of_predictions_whatever_these_count_from(clouds, monkeypatch):
-    module = _module()
+    module = _module(state_range=2.0)
     spread = iter(torch.linspace(-1, 1, 40).split(16))
     predict = module.estimator.predict
 
