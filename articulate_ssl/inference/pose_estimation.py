@@ -6,7 +6,8 @@
 3. *Registration* at test time: the leading hypotheses' predicted shapes are registered to the cloud without leaving
    their joints, and the best reconstruction wins. What is decided for in the end takes the cloud's own proportions
    (`proportions`), turned as its parts' faces say (`part_frames`), with the shape that clouds of the collection have
-   in common (`common_shape`), after which faces are looked at again.
+   in common (`common_shape`), after which faces are looked at again; and if its joints are then beyond their limits,
+   it gives way to what is within them (`final_fit`).
    Where parts slide, clouds of other objects that are most like it decide which way round it is; where these are
    labelled, they say which parts points are of, and where the category's shape is (`sliding_search`).
    Where simulated views taught, those that a view is most like decide which way round it is, and say with the
@@ -15,7 +16,7 @@
    between the winner and its twin (`two_ways`), which is registered, too, if the winner was. Where fits tell them
    apart, a network that they taught decides between the winner and its rival (`surface_decision`).
 5. *Side*, where some doors are hinged at another side than most: frames are turned so that what is seen looks right
-   (`hinge_sides`).
+   (`hinge_sides`), and what stood wrongly is explained anew.
 6. *Hand*, where upright cameras see objects and their mirror images: clouds are explained in a mirror, too, and how
    well either explains them decides (`handedness`).
 
