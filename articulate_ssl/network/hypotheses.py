@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import torch
@@ -107,14 +107,7 @@ class Hypotheses:
         def put(own: Tensor, new: Tensor) -> Tensor:
             return own.index_copy(0, index, new.to(own))
 
-        lines = {name: put(getattr(self.structure, name), getattr(other.structure, name)) for name in LINES}
-        return replace(
-            self,
-            shape=CanonicalShape(*map(put, self.shape, other.shape)),
-            structure=replace(self.structure, **lines),
-            base=put(self.base, other.base),
-            state=put(self.state, other.state),
-        )
+        return _merged(self, other, put)
 
     def at(
         self,
@@ -164,11 +157,16 @@ def either(
     def chosen(first: Tensor, second: Tensor) -> Tensor:
         return torch.where(where.view(-1, *[1] * (first.dim() - 1)), first, second)
 
-    structure = {name: chosen(getattr(one.structure, name), getattr(other.structure, name)) for name in LINES}
+    return _merged(one, other, chosen)
+
+
+def _merged(one: Hypotheses, other: Hypotheses, merge: Callable[[Tensor, Tensor], Tensor]) -> Hypotheses:
+    """Shapes, lines and poses of both as `merge` has them; part proposals are those of `one`."""
+    lines = {name: merge(getattr(one.structure, name), getattr(other.structure, name)) for name in LINES}
     return replace(
         one,
-        shape=CanonicalShape(*map(chosen, one.shape, other.shape)),
-        structure=replace(one.structure, **structure),
-        base=chosen(one.base, other.base),
-        state=chosen(one.state, other.state),
+        shape=CanonicalShape(*map(merge, one.shape, other.shape)),
+        structure=replace(one.structure, **lines),
+        base=merge(one.base, other.base),
+        state=merge(one.state, other.state),
     )
