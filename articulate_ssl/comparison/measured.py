@@ -18,8 +18,7 @@ from articulate_ssl.comparison.rows import rows_of
 from articulate_ssl.pretrained.rebuild import commit_of
 from datamodules.atomic import atomic_write
 
-# What a table reads is kept, and what a reader needs to know which run it was; curves and calibrations are not.
-_LEFT_OUT = ("calibration", "columns", "checkpoint", "reliability")
+_LEFT_OUT = ("calibration", "columns", "checkpoint")  # of a report: no table reads them
 
 
 @dataclass(frozen=True)
@@ -41,9 +40,9 @@ class Measured:
         return self._kept(job) is not None
 
     def report(self, job: Job, column: str | None) -> dict[str, Any] | None:
-        """`Job.report` as it is kept, with the `commit` that measured it; None for what is not."""
+        """`Job.report` as it is kept; None for what is not."""
         kept = self._kept(job)
-        return None if kept is None else kept["reports"][column or job.learner] | {"commit": kept["commit"]}
+        return None if kept is None else kept["reports"][column or job.learner]
 
     def keep(self, jobs: Iterable[Job]) -> list[Path]:
         """Keep the reports of finished jobs that are not kept yet; returns their files."""
@@ -65,7 +64,7 @@ class Measured:
             return None
         try:
             kept = json.loads(file.read_text())
-            effort, _, _ = kept["effort"], kept["reports"], kept["commit"]
+            effort, _ = kept["effort"], kept["reports"]
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{file}: no results that were kept ({error!r}); delete it to measure them anew") from None
         return kept if effort == _effort(job) else None

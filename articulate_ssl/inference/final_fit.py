@@ -24,8 +24,8 @@ from articulate_ssl.network.articulated_network import ArticulatedNetwork
 from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.ops.chamfer import chamfer
 
-# How much larger the error of what is within the joints' limits may be. Of ovens that were explained by a door beyond
-# them, the right explanation's was up to 1.23 times the other's (docs/experiments.md, step 144). Chosen.
+# How much larger the error of what is within the joints' limits may be. Rivals of ovens that were explained by a door
+# beyond them had up to 1.23 times the error (docs/experiments.md, step 144). Chosen.
 ABOUT_AS_WELL = 1.3
 
 
