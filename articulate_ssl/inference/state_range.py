@@ -74,7 +74,7 @@ class StateRange(nn.Module):
 
     def starts(self) -> Tensor:  # [1 + 2^J, J]
         """Where to start looking for joint states: the middle of the range, and in every combination either side."""
-        low, high = self.limits.unbind(-1)
+        low, high = self.known.unbind(-1)
         middle, side = (low + high) / 2, _SIDE * (high - low)
         sides = torch.cartesian_prod(*torch.stack([middle - side, middle + side], dim=-1)).view(-1, len(middle))
         return torch.cat([middle[None], sides])
