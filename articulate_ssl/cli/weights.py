@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from pathlib import Path
 
@@ -68,6 +69,7 @@ def _parser() -> argparse.ArgumentParser:
     teach = commands.add_parser("teach", help="what is learnt after training, anew: lessons without labels, and a test")
     teach.add_argument("names", nargs="+", help="categories or names")
     teach.add_argument("--lessons", nargs="+", help="default: all that apply; each builds on those before")
+    teach.add_argument("--data", default="", help='by other data than the card says: "--test-instances 60 …"')
     teach.add_argument("--build", type=Path, default=_LESSONS, help=f"for data and notes (default: {_LESSONS})")
     teach.add_argument("--folder", type=Path, default=WEIGHTS_FOLDER, help="where to (default: the package)")
     teach.set_defaults(do=_teach)
@@ -140,8 +142,8 @@ def _teach(args: argparse.Namespace) -> int:
 
     try:
         for weights in [weights for name in args.names for weights in _named(name)]:
-            card = Teaching(weights, tuple(args.lessons or LESSONS), args.build, args.folder).run(_say)
-            print(card.markdown())
+            lessons, data = tuple(args.lessons or LESSONS), tuple(shlex.split(args.data))
+            print(Teaching(weights, lessons, args.build, args.folder, data).run(_say).markdown())
     except StageFailed as error:
         print(f"articulate-ssl weights: {error}", file=sys.stderr)
         return _NOT_REPRODUCED

@@ -134,7 +134,7 @@ class FinalFit:
         `StateRange` starts; 3 for one joint.
         """
         rotations = rotation_group(60).elements.to(points)
-        rotations = rotations[self.registration.observation.orientation.contains(rotations)]
+        rotations = rotations[self.registration.observation.allows(rotations)]
         shape = self.articulated.category.articulated_shape(self.articulated.joint_type)
         starts = self.registration.states.starts().to(points)
         base, state, error = search_articulated(shape, points, rotations, starts)
@@ -144,7 +144,7 @@ class FinalFit:
         """The best that is found within the joints' limits, H = 1."""
         found = self.search(points)
         allowed = self.registration.states.contains(found.state)
-        turned = self.registration.observation.orientation.contains(found.base[..., :3, :3])
+        turned = self.registration.observation.allows(found.base[..., :3, :3])
         return found.select(found.error.masked_fill(~(allowed & turned), torch.inf).argmin(dim=1))
 
     def _within(self, one: Hypotheses) -> Tensor:  # [B] bool

@@ -12,6 +12,8 @@ quarter turns, and of the points only those of the body that lie behind the door
 Some bodies say nothing, but doors do: of a safe the lock is above the handle. Where a door is hinged on the other side,
 objects are explained upside down; and who sees every object in the mirror as often as it is does not know at which side
 its hinge is. So there, all of a cloud is seen, as it is and in the mirror, and half turns are told.
+
+A camera that is held upright knows which way is up (`upright_camera`); in its views no network is asked.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.inference.part_frames import PartFrames
 from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.inference.surface_decision import LOOKS, SIZE, WithSurface
+from articulate_ssl.inference.upright_camera import UprightCamera
 from articulate_ssl.network.surface_network import SurfaceCloud, SurfaceSize
 from articulate_ssl.ops.chamfer import nearest_distance
 from articulate_ssl.ops.spin_images import SPIN_CHANNELS, spin_images
@@ -79,10 +82,12 @@ class HingeSides(WithSurface):
         door: [3] canonical space, the middle of the closed door.
         log_prior: [TURNS] logarithm of the share of objects that are to be turned so; as many as there are ways count.
         surface: How right a body looks.
+        camera: Which way is up, for a camera that is held upright.
     """
 
     def __init__(self) -> None:
         super().__init__()
+        self.camera = UprightCamera()
         self.register_buffer("learnt", torch.tensor(False))
         self.register_buffer("whole", torch.tensor(False))
         self.register_buffer("closed", torch.tensor(0.0))
@@ -153,17 +158,22 @@ class HingeSides(WithSurface):
     def decided(
         self,
         prediction: Prediction,  # joint states count from the closed door
-        dense: Tensor,  # [B, P, 3]
+        dense: Tensor | None,  # [B, P, 3]
     ) -> tuple[Prediction, Tensor]:  # , [B]
-        """The same, its frame turned so that the body looks right; its margin is at most how sure that is.
+        """The same, its frame turned so that it stands, or the body looks right.
 
-        Where less is seen of a body than the network reads, nothing is decided.
+        Its margin is at most how sure it is that the body does. Where less is seen of a body than the network reads,
+        nothing is decided.
 
         Returns:
             That, and by how many quarters frames were turned.
         """
-        if dense.shape[1] < LOOKS * self.size.read:
-            return prediction, torch.zeros(len(dense), dtype=torch.long, device=dense.device)
+        if self.camera.learnt:
+            rotation = prediction.base_pose[:, :3, :3]
+            quarters = self.camera.stood(rotation)[1]
+            return turned_about(prediction, rotation @ self.camera.normal.to(rotation), quarters), quarters
+        if dense is None or dense.shape[1] < LOOKS * self.size.read:
+            return prediction, torch.zeros_like(prediction.joint_parent[:, 0])
         bodies = self.bodies(prediction, dense, (dense,))
         odds = self.looks_right(bodies) + self.log_prior[: len(self.quarters)].to(dense)
         best, ways = odds.topk(2, dim=1)

@@ -68,6 +68,7 @@ from articulate_ssl.shape.observation import Observation
 
 # Of the width of a joint's range: registration, before proportions, leaves doors 10 degrees off and more. Chosen.
 _WELL_BEYOND = 0.15
+_RARE = 1.1  # by which errors of what is hinged elsewhere than most count more (docs/experiments.md, step 153). Chosen.
 
 
 class PoseEstimator:
@@ -106,7 +107,7 @@ class PoseEstimator:
         inference: InferenceOptions,
     ) -> None:
         self.articulated, self.rigid, self.iterations = articulated, rigid, iterations
-        self.observation, self.posterior_scale, self.inference = observation, posterior_scale, inference
+        self.posterior_scale, self.inference = posterior_scale, inference
         self.two_ways = TwoWays(articulated.num_parts, articulated.num_parts * NUM_FEATURES)
         self.sliding = SlidingSearch(*articulated.category.template.shape[:2])
         self.view_search = ViewSearch(articulated.num_parts)
@@ -115,7 +116,8 @@ class PoseEstimator:
         self.states = StateRange(articulated.num_parts - 1)
         self.part_frames = PartFrames(articulated.num_parts)
         self.common_shape = CommonShape(articulated.num_parts)
-        self.registration = HypothesisRegistration(inference, observation, self.states)
+        self.observation = replace(observation, camera=self.hinge_sides.camera)
+        self.registration = HypothesisRegistration(inference, self.observation, self.states)
         self.final = FinalFit(
             articulated, self.registration, self.part_frames, self.common_shape, inference.proportions
         )
@@ -196,10 +198,9 @@ class PoseEstimator:
         *seen, error = self._explained(points, num_points, refine, dense, fits)
         if self.hinge_sides.learnt:
             seen = [self.hinge_sides.counted_from_closed(one) for one in seen]
-            if dense is not None:
-                seen[0], quarters = self.hinge_sides.decided(seen[0], dense)
-                if fits and (self.inference.refine if refine is None else refine) is not False:
-                    seen[0] = self._as_most_are(seen[0], quarters, points, dense)
+            seen[0], quarters = self.hinge_sides.decided(seen[0], dense)
+            if fits and (self.inference.refine if refine is None else refine) is not False:
+                seen[0] = self._as_most_are(seen[0], quarters, points, dense)
         if not self.handedness.learnt:
             return tuple(seen)
         dense = None if dense is None else in_the_mirror(dense)
@@ -238,7 +239,7 @@ class PoseEstimator:
         turned: Prediction,  # joint states count from the closed door
         quarters: Tensor,  # [B] by which frames were turned
         points: Tensor,  # [B, N, 3]
-        dense: Tensor,  # [B, P, 3]
+        dense: Tensor | None,  # [B, P, 3]
     ) -> Prediction:
         """Predictions whose frames were turned, or, if that fits better, objects in these frames hinged as most are.
 
@@ -247,7 +248,7 @@ class PoseEstimator:
         rows = quarters.nonzero()[:, 0]
         if not len(rows):
             return turned
-        own, seen, middle = points[rows], dense[rows], self.states.starts()[:1].to(points)
+        own, seen, middle = points[rows], None if dense is None else dense[rows], self.states.starts()[:1].to(points)
         base = turned.base_pose[rows, None]
         start = self.articulated.category_at(base, middle.expand(len(rows), 1, -1))
         tried = self.final.in_proportion(self.registration.freed(start, own), own, seen)
@@ -332,12 +333,16 @@ class PoseEstimator:
     def _best(self, candidates: Candidates) -> tuple[Hypotheses, Hypotheses, Tensor]:
         """The best candidate of every cloud, its rival, and the margin between them [B].
 
-        Errors of those whose joints are well beyond their limits count more, by as much as `FinalFit` lets them.
+        Errors of those whose joints are well beyond their limits count more, by as much as `FinalFit` lets them; and a
+        little more, where it is known which way is up, those of what lies on its side, as few are hinged elsewhere.
         """
         rotation, likely = candidates.base[..., :3, :3], self.states.contains(candidates.state, _WELL_BEYOND)
         error = torch.where(likely, candidates.error, ABOUT_AS_WELL * candidates.error)
+        camera = self.hinge_sides.camera
+        if camera.learnt:
+            error = torch.where(camera.stood(rotation)[1] > 0, _RARE * error, error)
         best = self.observation.ranked(error, rotation).argmin(dim=1)
-        allowed = self.observation.orientation.contains(rotation)
+        allowed = self.observation.allows(rotation)
         rival, margin = rivals(error, candidates.base, best, allowed)
         return candidates.select(best), candidates.select(rival), margin
 

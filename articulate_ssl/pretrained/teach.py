@@ -1,8 +1,8 @@
 """What shipped weights learn after their training, taught anew: the lessons that have grown since, and the card.
 
 A training is an hour, and what it leaves stays good while what decides and measures afterwards (`training.module`'s
-`LESSONS`) gets better. So lessons are taught again, by the weights' own training clouds and without labels; the test
-objects of the card are tested anew. What is finished stays if it is killed.
+`LESSONS`) gets better. So lessons are taught again, by the weights' own training clouds and without labels, or by
+those of more objects; the test objects of the card are tested anew. What is finished stays if it is killed.
 """
 
 from __future__ import annotations
@@ -31,6 +31,9 @@ from articulate_ssl.training.weights_card import CARD_SUFFIX, WeightsCard
 from articulate_ssl.training.weights_file import write_weights
 from datamodules.atomic import atomic_write
 
+# What a card says of its data beside the command, and which option that is.
+_TOLD = {"seed": "--seed", "train_instances": "--train-instances", "test_instances": "--test-instances"}
+
 
 @dataclass(frozen=True)
 class Teaching:
@@ -41,15 +44,19 @@ class Teaching:
         lessons: Of `LESSONS`.
         build: Folder for data, logs, and what is finished.
         folder: Where weights and card go in the end.
+        data: Options of the generator that take the place of the card's own, as more test objects.
     """
 
     weights: ShippedWeights
     lessons: tuple[str, ...]
     build: Path
     folder: Path = WEIGHTS_FOLDER
+    data: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Raises: CheckpointError for a lesson that there is not."""
+        """Raises: CheckpointError for a lesson that there is not, or an option without a value."""
+        if len(self.data) % 2 or not all(word.startswith("--") for word in self.data[::2]):
+            raise CheckpointError(f"{shlex.join(self.data)}: options of the generator come with a value each")
         if unknown := sorted(set(self.lessons) - set(LESSONS)):
             raise CheckpointError(f"{', '.join(unknown)}: no such lesson; there are {', '.join(LESSONS)}")
 
@@ -60,9 +67,9 @@ class Teaching:
             CheckpointError: if the weights have no card.
             StageFailed: if no data can be made.
         """
-        card = WeightsCard.load(self.weights.file.with_suffix(CARD_SUFFIX))
+        card = self._of_its_data(WeightsCard.load(self.weights.file.with_suffix(CARD_SUFFIX)))
         root = self._make_data(card, say)
-        digest = hashlib.sha256(self.weights.file.read_bytes()).hexdigest()
+        digest = hashlib.sha256(self.weights.file.read_bytes() + card.data["command"].encode()).hexdigest()
         done = self._done(digest)
         module = load_module(self._taught if done else self.weights.file)
         data = data_of(card, root, module.num_points)
@@ -83,9 +90,23 @@ class Teaching:
         new.save(file.with_suffix(CARD_SUFFIX))
         return new
 
+    def _of_its_data(self, card: WeightsCard) -> WeightsCard:
+        """The card with the data that are asked for."""
+        if not self.data:
+            return card
+        words = shlex.split(card.data["command"])
+        for option, value in zip(self.data[::2], self.data[1::2], strict=True):
+            if option in words:
+                words[words.index(option) + 1] = value
+            else:
+                words += [option, value]
+        told = {name: int(words[words.index(option) + 1]) for name, option in _TOLD.items() if option in words}
+        return replace(card, data=card.data | told | {"command": shlex.join(words)})
+
     def _make_data(self, card: WeightsCard, say: Callable[[str], None]) -> Path:
         """As the card's command says."""
-        root, work = self._place / "data", Workplace(self.weights.name, self._place)
+        name = "-".join(["data", *(word.strip("-") for word in self.data)])  # another set needs another folder
+        root, work = self._place / name, Workplace(self.weights.name, self._place)
         words = shlex.split(card.data["command"])[1:]  # `python` is this one
         stage = Stage("data", (sys.executable, *words, "--workers", "1", "--out", str(root)))
         if work.seconds(stage) is None:

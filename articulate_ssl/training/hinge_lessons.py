@@ -4,7 +4,8 @@ No label is read. A network is taught that objects stand right as they are predi
 of them, though of ovens one in nine lies on its side. What it disagrees with is turned, and it is taught anew, twice:
 it then stands more than nine in ten of the lying ovens up and turns over one in fifty others (docs/experiments.md,
 step 124). If all bodies seem to stand alike, it is taught anew by whole clouds and their mirror images, once, and each
-lesson is doubted: three without doubt teach no more (step 130).
+lesson is doubted: three without doubt teach no more (step 130). In views of an upright camera nothing of that is
+needed.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ _ROUNDS = 3  # of lessons about bodies
 _DOUBT = 0.06  # share of the lessons about whole clouds that may be wrong. No other was tried.
 # Share of the first clouds in which enough of the body is seen, without which nothing is learnt. Chosen.
 _FIRST, _KNOWN = 64, 0.9
+_VIEWS = 256  # of an upright camera, from which nothing is learnt but a direction and a share. Chosen.
 # Shares of the clouds that the network was not taught by. Chosen: fewer that are turned are not worth a network; more
 # would mean that most are not right; and one that cannot tell sides apart is undecided of many.
 _LEAST_TURNED, _MOST_TURNED, _MOST_UNDECIDED, _DECIDED = 0.02, 0.4, 0.15, 2.0
@@ -46,14 +48,21 @@ def learn_hinge_sides(
     clouds: Tensor,  # [n, N, 3] farthest-point order, dense
 ) -> None:
     """Find out whether some objects are hinged at another side than most."""
-    sides, network = module.estimator.hinge_sides, module.articulated
+    estimator, network = module.estimator, module.articulated
+    sides = estimator.hinge_sides
     sides.learnt.fill_(False)  # of a run that ended and goes on
     sides.whole.fill_(False)
+    sides.camera.forget()
     sides.surface = None
     if network.num_parts != 2 or network.joint_type != REVOLUTE or TAUGHT * len(clouds) < FEWEST:
         return
+    if estimator.view_search.learnt or estimator.handedness.learnt:
+        return  # simulated views, or two hands, say more of which way round views are
     shape = network.category.articulated_shape(network.joint_type)
-    sides.measure(shape, module.states.limits, module.estimator.part_frames)
+    sides.measure(shape, module.states.known, estimator.part_frames)
+    if module.orientation.limited:
+        _learn_upright(module, clouds[:_VIEWS])
+        return
     predictions = _predictions(module, clouds[:_FIRST])
     if _bodies(module, clouds[:_FIRST], predictions).known.double().mean() < _KNOWN:
         log.info("hinge sides: too little is seen behind the closed door")
@@ -70,6 +79,20 @@ def learn_hinge_sides(
         return
     sides.whole.fill_(False)
     sides.surface = None
+
+
+def _learn_upright(module: ArticulatedPoseModule, views: Tensor) -> None:
+    """Find out which way is up for an upright camera, and whether some objects do not stand as they are predicted."""
+    sides = module.estimator.hinge_sides
+    rotation = torch.cat([one.base_pose[:, :3, :3] for one in _predictions(module, views)])
+    sides.camera.learn(rotation, sides.axes)
+    if sides.camera.learnt:
+        _, quarters, stand = sides.camera.stood(rotation)
+        other, undecided = float((quarters > 0).double().mean()), float((~stand).double().mean())
+        log.info("hinge sides, by an upright camera: %.0f %% lie, undecided %.0f %%", 100 * other, 100 * undecided)
+        sides.learnt.fill_(_LEAST_TURNED <= other <= _MOST_TURNED and undecided <= _MOST_UNDECIDED)
+    if not sides.learnt:
+        sides.camera.forget()
 
 
 def _learnt(module: ArticulatedPoseModule, bodies: Bodies) -> bool:

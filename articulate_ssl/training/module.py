@@ -95,8 +95,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         part_frames_samples: Training clouds from which it is learnt which parts have faces that say how they are
             turned, where parts turn (`inference.part_frames`), and if so, of complete clouds, which shape they have in
             common (`inference.common_shape`); 0 learns nothing of it.
-        hinge_sides_samples: Training clouds in any orientation from which it is learnt whether some objects are hinged
-            at another side than most (`inference.hinge_sides`); 0 learns nothing of it.
+        hinge_sides_samples: Training clouds from which it is learnt whether some objects are hinged at another side
+            than most (`inference.hinge_sides`); 0 learns nothing of it.
         orientation_range: How far objects are turned from their mean orientation at most, in degrees; 180 stands for
             any orientation, less where a camera is held upright.
 
@@ -222,7 +222,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             "turns": (learn_turns, self.two_ways_samples if refines and any_way and self.sliding.learnt else 0),
             "handedness": (learn_handedness, 0 if any_way else self.handedness_samples),
             "part_frames": (learn_part_frames, self.part_frames_samples if refines and turns else 0),
-            "hinge_sides": (learn_hinge_sides, self.hinge_sides_samples if refines and any_way else 0),
+            "hinge_sides": (learn_hinge_sides, self.hinge_sides_samples if refines else 0),
             "joint_limits": limits,
             "confidence": (learn_confidence, calibration),
         }

@@ -107,3 +107,16 @@ def test_what_was_cut_off_goes_on_and_other_weights_begin_anew(shipped, tmp_path
 def test_lessons_that_there_are_not_are_named(shipped, tmp_path):
     with pytest.raises(CheckpointError, match="astronomy: no such lesson; there are first_limits, two_ways"):
         Teaching(shipped, ("astronomy",), tmp_path)
+
+
+def test_other_data_take_the_place_of_the_cards(shipped, tmp_path, made, learnt):
+    data = ("--train-instances", "5", "--test-instances", "4", "--states", "2")
+    build, out = tmp_path / "build", tmp_path / "out"
+    Teaching(shipped, ("confidence",), build, out).run(print)
+    card = Teaching(shipped, ("confidence",), build, out, data).run(print)
+    told = "--seed 11 --train-instances 5 --test-instances 4 --states 2"
+    assert told in made[1] and card.data["command"].endswith(told)
+    assert (card.data["train_instances"], card.data["test_instances"], card.data["seed"]) == (5, 4, 11)
+    assert learnt == ["confidence"] * 2  # nothing that other clouds taught is taken for taught
+    with pytest.raises(CheckpointError, match="--states: options of the generator come with a value each"):
+        Teaching(shipped, ("confidence",), build, out, ("--states",))
