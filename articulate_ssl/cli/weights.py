@@ -1,4 +1,4 @@
-"""`articulate-ssl weights list|show|pack|rebuild|teach|check`: the weights that come with the package."""
+"""`articulate-ssl weights list|show|pack|rebuild|teach|check|ablate`: the weights that come with the package."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ _BUILD = Path("build/weights")
 _LESSONS = Path("build/weights-teach")
 _CHECKS = Path("build/weights-check")
 _CHECK_SEED = 12
+_ABLATIONS = Path("build/weights-ablate")
+_ABLATION_SEED, _ABLATION_SAMPLES = 57, 240
 
 
 def run(arguments: list[str]) -> int:
@@ -43,7 +45,7 @@ def run(arguments: list[str]) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="articulate-ssl weights", description="Weights that come with the package.")
-    commands = parser.add_subparsers(required=True, metavar="list|show|pack|rebuild|teach|check")
+    commands = parser.add_subparsers(required=True, metavar="list|show|pack|rebuild|teach|check|ablate")
     listed = commands.add_parser("list", help="which there are, and what they are worth")
     listed.add_argument("--markdown", choices=list(VIEWS), metavar="VIEW", help="README's table of one view instead")
     listed.set_defaults(do=_list)
@@ -79,6 +81,14 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("--seed", type=int, default=_CHECK_SEED, help=f"of the fresh data (default: {_CHECK_SEED})")
     check.add_argument("--build", type=Path, default=_CHECKS, help=f"for data and results (default: {_CHECKS})")
     check.set_defaults(do=_check)
+
+    ablate = commands.add_parser("ablate", help="what is lost without each thing that was learnt after training")
+    ablate.add_argument("names", nargs="+", help="categories or names")
+    ablate.add_argument("--seed", type=int, default=_ABLATION_SEED, help=f"of the data (default: {_ABLATION_SEED})")
+    samples = f"test clouds at most (default: {_ABLATION_SAMPLES})"
+    ablate.add_argument("--samples", type=int, default=_ABLATION_SAMPLES, help=samples)
+    ablate.add_argument("--build", type=Path, default=_ABLATIONS, help=f"for data and results (default: {_ABLATIONS})")
+    ablate.set_defaults(do=_ablate)
     return parser
 
 
@@ -171,6 +181,15 @@ def _check(args: argparse.Namespace) -> int:
     if more_than_chance(found):
         print("more are worse than chance explains: the cards do not hold")
         return _NOT_REPRODUCED
+    return 0
+
+
+def _ablate(args: argparse.Namespace) -> int:
+    from articulate_ssl.pretrained.ablation import Study, as_markdown
+
+    for weights in [weights for name in args.names for weights in _named(name)]:
+        found = Study(weights, args.seed, args.samples, args.build).run(_say)
+        print(f"\n{weights.name}, data seed {args.seed}, {found[0][1]['samples']} clouds\n\n{as_markdown(found)}")
     return 0
 
 

@@ -98,6 +98,10 @@ class SlidingSearch(WithSurface):
         """Whether there is anything to search for."""
         return len(self.gallery) > 0
 
+    def forget(self) -> None:
+        """As before anything was learnt."""
+        self.gallery = self.gallery[:0]
+
     def learn(
         self,
         shape: ArticulatedShape,  # M points of every part in turn, in a frame common to the clouds

@@ -72,6 +72,10 @@ class ViewSearch(nn.Module):
         """Whether there are views."""
         return len(self.views) > 0
 
+    def forget(self) -> None:
+        """As before there were any."""
+        self.views = self.views[:0]
+
     def learn(
         self,
         views: Tensor,  # [n, N, 3] farthest-point order

@@ -84,13 +84,11 @@ def check(
         CheckpointError: if the weights have no card, the seed is the card's own, or no data can be made.
     """
     card = WeightsCard.load(weights.file.with_suffix(CARD_SUFFIX))
-    if seed == card.data["seed"]:
-        raise CheckpointError(f"seed {seed} is that of the data behind {weights.name}; take another")
     place = build / f"{weights.name}-seed-{seed}"
     note, digest = place / "tested.json", hashlib.sha256(weights.file.read_bytes()).hexdigest()
     if not note.is_file() or json.loads(note.read_text())["sha256"] != digest:
         say(f"{weights.name}: data of seed {seed} …")
-        _make_data(card, seed, place)
+        make_data(card, seed, place)
         say(f"{weights.name}: test …")
         module = load_module(weights.file)
         metrics = tested(module, data_of(card, place / "data", module.num_points), place)
@@ -134,7 +132,14 @@ def _allowed(quantity: str, card: dict[str, Any], fresh: dict[str, Any]) -> floa
     return max(chance, _TRIFLE_DEGREES if in_degrees else _TRIFLE_SHARE)
 
 
-def _make_data(card: WeightsCard, seed: int, place: Path) -> None:
+def make_data(card: WeightsCard, seed: int, place: Path) -> None:
+    """Data of another seed as the card says, in a folder `data` of a place; fewer training objects are enough.
+
+    Raises:
+        CheckpointError: if the seed is the card's own, or no data can be made.
+    """
+    if seed == card.data["seed"]:
+        raise CheckpointError(f"seed {seed} is that of the data behind {card.category}-{card.view}; take another")
     words = shlex.split(card.data["command"])[1:]  # `python` is this one
     words[words.index("--seed") + 1] = str(seed)
     train = words.index("--train-instances") + 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from importlib import resources
 from typing import Any
 
@@ -30,24 +30,38 @@ _NOTHING = "–"
 def as_markdown(cards: Iterable[WeightsCard], view: str) -> str:
     """A table of the weights of one view: means, some with their 95 % intervals, and what the paper prints."""
     rows = [_row(card) for card in cards if card.view == view]
-    headings = ("category", *(heading for heading, *_ in _COLUMNS), "objects", "paper: R (folded); axis; mIoU")
-    ruler = ("---", *("---:" for _ in headings[1:-1]), "---")
+    return table_of("category", rows, "objects", "paper: R (folded); axis; mIoU")
+
+
+def table_of(first: str, rows: Iterable[Sequence[str]], *last: str) -> str:
+    """A table whose rows have a name, `cells_of` metrics, and some more.
+
+    Args:
+        first, last: Headings.
+    """
+    headings = (first, *(heading for heading, *_ in _COLUMNS), *last)
+    ruler = ("---", *("---:" for _ in _COLUMNS), *("---:" for _ in last[:-1]), *("---" for _ in last[-1:]))
     return "\n".join("| " + " | ".join(cells) + " |" for cells in (headings, ruler, *rows)) + "\n"
 
 
-def _row(card: WeightsCard) -> list[str]:
-    metrics = card.metrics
-    cells = [_cell(metrics[quantity], quantity, digits, whole, card) for _, quantity, digits, whole in _COLUMNS]
+def cells_of(metrics: dict[str, Any]) -> list[str]:
+    """Means of `metrics.json`, some with their 95 % intervals."""
+    cells = [_cell(metrics, quantity, digits, whole) for _, quantity, digits, whole in _COLUMNS]
     cells[0] += f", median {metrics['r_err_deg']['median']:.1f}"
+    return cells
+
+
+def _row(card: WeightsCard) -> list[str]:
     name = card.category + (f" {MARK}" if card.setting else "")
-    return [name, *cells, str(metrics["instances"]), _printed(card)]
+    return [name, *cells_of(card.metrics), str(card.metrics["instances"]), _printed(card)]
 
 
-def _cell(value: dict[str, Any], quantity: str, digits: int | None, whole: bool, card: WeightsCard) -> str:
+def _cell(metrics: dict[str, Any], quantity: str, digits: int | None, whole: bool) -> str:
+    value = metrics[quantity]
     if value["mean"] is None:
         return _NOTHING
     if digits is None:  # what slides has states in lengths, and no pivots
-        digits = 3 if card.metrics["pivot_err"]["mean"] is None else 1
+        digits = 3 if metrics["pivot_err"]["mean"] is None else 1
     scale = 100 if quantity in PERCENT else 1
     mean = f"{scale * value['mean']:.{digits}f}"
     if value["ci95"] is None or not whole:

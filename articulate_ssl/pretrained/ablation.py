@@ -1,0 +1,141 @@
+"""What each thing that shipped weights have learnt after training is worth: the same clouds without it.
+
+Nothing is trained anew. Of weights that are loaded again one thing is left out, the rest stays as it was learnt with
+it, and what is predicted is calibrated and tested as ever. So a row says what is lost if one thing goes, not what
+would be learnt without it. Objects are of a data seed of their own: those of the card are for the card.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from articulate_ssl.inference.pose_estimation import PoseEstimator
+from articulate_ssl.pretrained.check import data_of, make_data, tested
+from articulate_ssl.pretrained.markdown_table import cells_of, table_of
+from articulate_ssl.training.checkpoint import load_module
+from articulate_ssl.training.shipped_weights import ShippedWeights
+from articulate_ssl.training.weights_card import CARD_SUFFIX, WeightsCard
+from datamodules.atomic import atomic_write
+
+NOTHING = "nothing"
+
+
+@dataclass(frozen=True)
+class Ablation:
+    """One thing to leave out.
+
+    Attributes:
+        name: Of it, for tables.
+        known: Whether weights have it.
+        forget: Leaves it out.
+    """
+
+    name: str
+    known: Callable[[PoseEstimator], bool]
+    forget: Callable[[PoseEstimator], None]
+
+
+def _no_sides(estimator: PoseEstimator) -> None:
+    estimator.hinge_sides.learnt.fill_(False)
+    estimator.hinge_sides.camera.forget()
+
+
+def _no_decision(estimator: PoseEstimator) -> None:
+    estimator.two_ways.learnt.fill_(False)
+    estimator.two_ways.surface = None
+
+
+def _no_proportions(estimator: PoseEstimator) -> None:
+    estimator.final.cycles = 0
+
+
+def _no_network_that_decides(estimator: PoseEstimator) -> None:
+    estimator.two_ways.surface = None
+
+
+def _no_network_of_turns(estimator: PoseEstimator) -> None:
+    estimator.sliding.surface = None
+
+
+ABLATIONS = (
+    Ablation(NOTHING, lambda _: True, lambda _: None),
+    Ablation(
+        "the network that decides which way round",
+        lambda of: of.two_ways.surface is not None,
+        _no_network_that_decides,
+    ),
+    Ablation("relief and that network", lambda of: bool(of.two_ways.learnt), _no_decision),
+    Ablation(
+        "the network that decides which way round", lambda of: of.sliding.surface is not None, _no_network_of_turns
+    ),
+    Ablation("the search in the collection", lambda of: of.sliding.learnt, lambda of: of.sliding.forget()),
+    Ablation("the search among simulated views", lambda of: of.view_search.learnt, lambda of: of.view_search.forget()),
+    Ablation("which side is up", lambda of: bool(of.hinge_sides.learnt), _no_sides),
+    Ablation("mirror images", lambda of: bool(of.handedness.learnt), lambda of: of.handedness.learnt.fill_(False)),
+    Ablation("joint limits", lambda of: of.states.learnt, lambda of: of.states.forget()),
+    Ablation(
+        "faces, and the common shape", lambda of: of.part_frames.learnt, lambda of: of.part_frames.flat.fill_(False)
+    ),
+    Ablation("the common shape", lambda of: of.common_shape.learnt, lambda of: of.common_shape.forget()),
+    Ablation("the cloud's own proportions, and all that builds on them", lambda of: of.final.fits, _no_proportions),
+)
+
+
+@dataclass(frozen=True)
+class Study:
+    """Of one set of weights.
+
+    Attributes:
+        weights: Which.
+        seed: Of the data.
+        samples: Test clouds, at most, spread over objects and states.
+        build: Folder for data and results; what is finished there is not repeated.
+    """
+
+    weights: ShippedWeights
+    seed: int
+    samples: int
+    build: Path
+
+    def run(self, say: Callable[[str], None]) -> list[tuple[str, dict[str, Any]]]:
+        """What is left out, and the content of `metrics.json` without it.
+
+        Raises:
+            CheckpointError: if the weights have no card, the seed is the card's own, or no data can be made.
+        """
+        card = WeightsCard.load(self.weights.file.with_suffix(CARD_SUFFIX))
+        place = self.build / f"{self.weights.name}-seed-{self.seed}"
+        if not (place / "made").is_file():
+            say(f"{self.weights.name}: data of seed {self.seed} …")
+            make_data(card, self.seed, place)
+            (place / "made").touch()
+        first = load_module(self.weights.file)
+        found = []
+        for ablation in (one for one in ABLATIONS if one.known(first.estimator)):
+            say(f"{self.weights.name}: without {ablation.name} …")
+            found.append((ablation.name, self._without(ablation, card, place)))
+        return found
+
+    def _without(self, ablation: Ablation, card: WeightsCard, place: Path) -> dict[str, Any]:
+        about = f"{hashlib.sha256(self.weights.file.read_bytes()).hexdigest()}, {self.samples} clouds"
+        note = place / f"without {ablation.name}.json"
+        if note.is_file() and (known := json.loads(note.read_text()))["of"] == about:
+            return known["metrics"]
+        module = load_module(self.weights.file)
+        ablation.forget(module.estimator)
+        data = data_of(card, place / "data", module.num_points)
+        data.hparams.max_test_samples = self.samples
+        metrics = tested(module, data, place)
+        with atomic_write(note) as file:
+            file.write(json.dumps({"of": about, "metrics": metrics}).encode())
+        return metrics
+
+
+def as_markdown(found: Sequence[tuple[str, dict[str, Any]]]) -> str:
+    """A table, a row for each thing that was left out."""
+    return table_of("without", [[name, *cells_of(metrics)] for name, metrics in found])

@@ -1,0 +1,80 @@
+"""What shipped weights are worth without each thing that they have learnt after training."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from packable import made_up_metrics
+from synthetic import write_synthetic_set
+from tiny import POINTS, fit, tiny_module
+
+from articulate_ssl.pretrained import ablation as module
+from articulate_ssl.pretrained.ablation import ABLATIONS, NOTHING, Study, as_markdown
+from articulate_ssl.training.checkpoint import load_module
+from articulate_ssl.training.shipped_weights import ShippedWeights, shipped_weights
+from articulate_ssl.training.weights_card import WeightsCard
+from articulate_ssl.training.weights_file import write_weights
+
+
+@pytest.fixture
+def shipped(tmp_path) -> ShippedWeights:
+    """Weights of a tiny module that knows joint limits, with a card."""
+    write_synthetic_set(tmp_path / "training")
+    network = tiny_module()
+    network.num_points = POINTS
+    fit(network, tmp_path / "training", 3)
+    network.states.seen.copy_(torch.tensor([[-9.0, 9.0]]))
+    weights = ShippedWeights("laptop", "complete", tmp_path / "laptop-complete.safetensors")
+    write_weights(network, weights.file)
+    WeightsCard(
+        category="laptop",
+        view="complete",
+        part_names=["base", "lid"],
+        data={"command": "python -m render.generate --category laptop --seed 11", "seed": 11},
+        training={},
+        metrics=made_up_metrics(),
+        weaknesses=[],
+        date="2026-01-02",
+    ).save(tmp_path / "laptop-complete.json")
+    return weights
+
+
+def test_what_weights_have_is_left_out_one_after_the_other_and_once(shipped, tmp_path, monkeypatch):
+    made, known = [], []
+
+    def data(_, seed: int, place: Path) -> None:
+        made.append(seed)
+        write_synthetic_set(place / "data")
+
+    tested = module.tested
+
+    def noted(network, *rest):
+        known.append((network.states.learnt, bool(network.estimator.final.cycles)))
+        return tested(network, *rest)
+
+    monkeypatch.setattr(module, "make_data", data)
+    monkeypatch.setattr(module, "tested", noted)
+    study, said = Study(shipped, 57, 6, tmp_path / "build"), []
+    found = study.run(said.append)
+    names = [name for name, _ in found]
+    assert names == [NOTHING, "joint limits", "the cloud's own proportions, and all that builds on them"]
+    assert known == [(True, True), (False, True), (True, False)]
+    assert all(metrics["samples"] == 6 for _, metrics in found)
+    assert [json.dumps(metrics) for _, metrics in study.run(said.append)] == [json.dumps(m) for _, m in found]
+    assert made == [57] and len(known) == 3
+    lines = as_markdown(found).splitlines()
+    assert len(lines) == 5 and lines[0].startswith("| without | R ° |") and lines[3].startswith("| joint limits |")
+    assert len({line.count("|") for line in lines}) == 1
+    Study(shipped, 57, 4, tmp_path / "build").run(said.append)
+    assert len(known) == 6
+
+
+@pytest.mark.parametrize("ablation", ABLATIONS[1:], ids=lambda one: one.name)
+def test_what_was_left_out_is_not_known_any_more(ablation):
+    """Of the weights in the package, which have all of it between them."""
+    having = [w for w in shipped_weights() if ablation.known(load_module(w.file).estimator)]
+    assert having, f"nothing in the package has {ablation.name}"
+    estimator = load_module(having[0].file).estimator
+    ablation.forget(estimator)
+    assert not ablation.known(estimator)
