@@ -9,10 +9,14 @@ from pathlib import Path
 import torch
 import yaml
 from synthetic import write_synthetic_set
-from tiny import fit, tiny_module
+from tiny import POINTS, fit, tiny_module
 
 from articulate_ssl.metrics.statistics import summarize
 from articulate_ssl.pretrained.pack import PROFILES
+from articulate_ssl.training.module import ArticulatedPoseModule
+from articulate_ssl.training.shipped_weights import ShippedWeights
+from articulate_ssl.training.weights_card import WeightsCard
+from articulate_ssl.training.weights_file import write_weights
 from datamodules.manifest import Manifest
 
 ROOT = Path(__file__).parents[3]
@@ -46,6 +50,32 @@ def made_up_metrics(scale: float = 1.0, state: float = 3.0) -> dict:
         "failures": 0,
         "category": "laptop",
     }
+
+
+def trained(folder: Path) -> ArticulatedPoseModule:
+    """A tiny module after three steps, that has been taught nothing."""
+    write_synthetic_set(folder / "training")
+    network = tiny_module()
+    network.num_points = POINTS
+    fit(network, folder / "training", 3)
+    return network
+
+
+def shipped_in(folder: Path, network: ArticulatedPoseModule, command: str) -> ShippedWeights:
+    """Weights with a made-up card, whose data the command makes."""
+    weights = ShippedWeights("laptop", "complete", folder / "laptop-complete.safetensors")
+    write_weights(network, weights.file)
+    WeightsCard(
+        category="laptop",
+        view="complete",
+        part_names=["base", "lid"],
+        data={"command": command, "seed": DATA_SEED},
+        training={"command": "lightning fit", "commit": "abc"},
+        metrics={name: value for name, value in made_up_metrics().items() if name != "category"},
+        weaknesses=["none"],
+        date="2026-01-02",
+    ).save(folder / "laptop-complete.json")
+    return weights
 
 
 def write_run(folder: Path) -> Path:

@@ -5,39 +5,21 @@ from pathlib import Path
 
 import pytest
 import torch
-from packable import made_up_metrics
+from packable import shipped_in, trained
 from synthetic import write_synthetic_set
-from tiny import POINTS, fit, tiny_module
 
 from articulate_ssl.pretrained import ablation as module
 from articulate_ssl.pretrained.ablation import ABLATIONS, NOTHING, Study, as_markdown
 from articulate_ssl.training.checkpoint import load_module
 from articulate_ssl.training.shipped_weights import ShippedWeights, shipped_weights
-from articulate_ssl.training.weights_card import WeightsCard
-from articulate_ssl.training.weights_file import write_weights
 
 
 @pytest.fixture
 def shipped(tmp_path) -> ShippedWeights:
     """Weights of a tiny module that knows joint limits, with a card."""
-    write_synthetic_set(tmp_path / "training")
-    network = tiny_module()
-    network.num_points = POINTS
-    fit(network, tmp_path / "training", 3)
+    network = trained(tmp_path)
     network.states.seen.copy_(torch.tensor([[-9.0, 9.0]]))
-    weights = ShippedWeights("laptop", "complete", tmp_path / "laptop-complete.safetensors")
-    write_weights(network, weights.file)
-    WeightsCard(
-        category="laptop",
-        view="complete",
-        part_names=["base", "lid"],
-        data={"command": "python -m render.generate --category laptop --seed 11", "seed": 11},
-        training={},
-        metrics=made_up_metrics(),
-        weaknesses=[],
-        date="2026-01-02",
-    ).save(tmp_path / "laptop-complete.json")
-    return weights
+    return shipped_in(tmp_path, network, "python -m render.generate --category laptop --seed 11")
 
 
 def test_what_weights_have_is_left_out_one_after_the_other_and_once(shipped, tmp_path, monkeypatch):

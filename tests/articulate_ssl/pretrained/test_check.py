@@ -4,16 +4,13 @@ import json
 import math
 
 import pytest
-from packable import made_up_metrics
+from packable import made_up_metrics, shipped_in, trained
 from synthetic import write_synthetic_set
-from tiny import fit, tiny_module
 
 from articulate_ssl.inference.checkpoint_file import CheckpointError
 from articulate_ssl.pretrained import check as module
 from articulate_ssl.pretrained.check import Comparison, check, compare, more_than_chance
-from articulate_ssl.training.shipped_weights import ShippedWeights
-from articulate_ssl.training.weights_card import HEADLINES, WeightsCard
-from articulate_ssl.training.weights_file import write_weights
+from articulate_ssl.training.weights_card import HEADLINES
 
 
 def test_equal_numbers_are_reproduced_and_much_worse_ones_are_not():
@@ -55,22 +52,9 @@ def test_a_few_numbers_are_worse_by_chance_and_many_are_not():
 @pytest.fixture
 def shipped(tmp_path):
     """Weights of a tiny module with a card."""
-    write_synthetic_set(tmp_path / "training")
-    network = tiny_module()
-    fit(network, tmp_path / "training", 3)
-    weights = ShippedWeights("laptop", "complete", tmp_path / "laptop-complete.safetensors")
-    write_weights(network, weights.file)
-    WeightsCard(
-        category="laptop",
-        view="complete",
-        part_names=["base", "lid"],
-        data={"command": "python -m render.generate --category laptop --seed 11 --train-instances 73", "seed": 11},
-        training={},
-        metrics=made_up_metrics(),
-        weaknesses=[],
-        date="2026-01-02",
-    ).save(tmp_path / "laptop-complete.json")
-    return weights
+    return shipped_in(
+        tmp_path, trained(tmp_path), "python -m render.generate --category laptop --seed 11 --train-instances 73"
+    )
 
 
 def test_weights_are_tested_on_data_of_another_seed_once(shipped, tmp_path, monkeypatch):

@@ -4,16 +4,14 @@ import json
 import shlex
 
 import pytest
-from packable import made_up_metrics
+from packable import made_up_metrics, shipped_in, trained
 from synthetic import write_synthetic_set
-from tiny import POINTS, fit, tiny_module
 
 from articulate_ssl.inference.checkpoint_file import CheckpointError
 from articulate_ssl.pretrained import stages
 from articulate_ssl.pretrained.teach import Teaching
 from articulate_ssl.training.checkpoint import load_module
 from articulate_ssl.training.module import LESSONS, ArticulatedPoseModule
-from articulate_ssl.training.shipped_weights import ShippedWeights
 from articulate_ssl.training.weights_card import WeightsCard
 from articulate_ssl.training.weights_file import write_weights
 
@@ -23,23 +21,7 @@ COMMAND = "python -m render.generate --category laptop --seed 11 --train-instanc
 @pytest.fixture
 def shipped(tmp_path):
     """Weights of a tiny module that was not taught, with a card."""
-    write_synthetic_set(tmp_path / "training")
-    network = tiny_module()
-    network.num_points = POINTS
-    fit(network, tmp_path / "training", 3)
-    weights = ShippedWeights("laptop", "complete", tmp_path / "laptop-complete.safetensors")
-    write_weights(network, weights.file)
-    WeightsCard(
-        category="laptop",
-        view="complete",
-        part_names=["base", "lid"],
-        data={"command": COMMAND, "seed": 11},
-        training={"command": "lightning fit", "commit": "abc"},
-        metrics={name: value for name, value in made_up_metrics().items() if name != "category"},
-        weaknesses=["none"],
-        date="2026-01-02",
-    ).save(tmp_path / "laptop-complete.json")
-    return weights
+    return shipped_in(tmp_path, trained(tmp_path), COMMAND)
 
 
 @pytest.fixture
