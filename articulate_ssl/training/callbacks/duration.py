@@ -12,6 +12,8 @@ from torch import Tensor
 
 MEASURED_STEPS = 20  # of training, before the estimate is corrected; chosen: some seconds with the `cpu` profile
 _WARM_SECONDS = 5.0  # a first step that takes as long says enough; a shorter one may have been mostly start-up
+# Which of them apply is not known before. Of 1,000 ovens they took as long as all before (docs/experiments.md, 156).
+_LESSONS = "then its lessons, without labels, which may take as long again"
 _UNITS = ((2 * 86400, 86400, "days"), (2 * 3600, 3600, "hours"), (100, 60, "minutes"), (0, 1, "seconds"))
 
 
@@ -65,7 +67,8 @@ class EstimateDuration(Callback):
         if not self._told:
             self._told = True
             first, begun = self._start
-            _say(trainer, _whole(self._discovery, now - begun + left, trainer.max_steps - first))
+            text = _whole(self._discovery, now - begun + left, trainer.max_steps - first)
+            _say(trainer, f"{text}; {_LESSONS}" if pl_module.inference.refine else text)
 
 
 def step_seconds(pl_module: LightningModule, data: Any) -> float:

@@ -69,7 +69,8 @@ def test_there_is_an_estimate_before_and_one_after_some_steps(root, capsys):
         r"lightning fit: at most [\d.]+ seconds for 26 steps \(.* s, measured\), after part discovery", first
     )
     assert re.fullmatch(
-        r"lightning fit: about [\d.]+ seconds in all: [\d.]+ of part discovery, [\d.]+ for 25 steps", second
+        r"lightning fit: about [\d.]+ seconds in all: [\d.]+ of part discovery, [\d.]+ for 25 steps; then its .*",
+        second,
     )
 
 
@@ -87,7 +88,7 @@ def test_the_second_estimate_is_what_was_measured(root, capsys, monkeypatch):
     trained(root, [Passing()], warmup_steps=6)
     first, second = (line for line in capsys.readouterr().out.splitlines() if line.startswith("lightning fit: "))
     assert first.endswith("at most 78 seconds for 26 steps (3 s, measured), after part discovery")
-    assert second.endswith("about 66 seconds in all: 1.0 of part discovery, 65 for 25 steps")
+    assert second.endswith("about 66 seconds in all: 1.0 of part discovery, 65 for 25 steps; " + duration._LESSONS)
 
 
 @pytest.mark.parametrize(
