@@ -12,9 +12,8 @@
    labelled, they say which parts points are of, and where the category's shape is (`sliding_search`).
    Where simulated views taught, those that a view is most like decide which way round it is, and say with the
    posed shape which parts points are of (`view_search`).
-4. *Decision*, where a category's clouds can be explained in two ways that fit alike: the relief of the surface decides
-   between the winner and its twin (`two_ways`), which is registered, too, if the winner was. Where fits tell them
-   apart, a network that they taught decides between the winner and its rival (`surface_decision`).
+4. *Decision* between two explanations of a cloud, where that was learnt (`decision`): the winner and its twin, which is
+   registered, too, if the winner was, or the winner and its rival.
 5. *Side*, where some doors are hinged at another side than most: frames are turned so that what is seen looks right
    (`hinge_sides`), and what stood wrongly is explained anew.
 6. *Hand*, where upright cameras see objects and their mirror images: clouds are explained in a mirror, too, and how
@@ -39,11 +38,10 @@ from articulate_ssl.inference.candidates import (
     Iteration,
     angle_to,
     better,
-    frames_of,
-    likelier,
     rivals,
 )
 from articulate_ssl.inference.common_shape import CommonShape
+from articulate_ssl.inference.decision import Decision
 from articulate_ssl.inference.final_fit import ABOUT_AS_WELL, FinalFit
 from articulate_ssl.inference.handedness import Handedness, in_the_mirror
 from articulate_ssl.inference.hinge_sides import HingeSides
@@ -52,10 +50,9 @@ from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.inference.packaging import as_prediction
 from articulate_ssl.inference.part_frames import PartFrames
 from articulate_ssl.inference.prediction import Prediction
-from articulate_ssl.inference.relief import NUM_FEATURES, relief_of
+from articulate_ssl.inference.relief import NUM_FEATURES
 from articulate_ssl.inference.sliding_search import SlidingSearch
 from articulate_ssl.inference.state_range import StateRange
-from articulate_ssl.inference.surface_decision import SurfaceDecision
 from articulate_ssl.inference.two_ways import TwoWays
 from articulate_ssl.inference.view_search import ViewSearch
 from articulate_ssl.losses.reconstruction import distances_to_parts
@@ -118,6 +115,7 @@ class PoseEstimator:
         self.common_shape = CommonShape(articulated.num_parts)
         self.observation = replace(observation, camera=self.hinge_sides.camera)
         self.registration = HypothesisRegistration(inference, self.observation, self.states)
+        self.decision = Decision(articulated, self.registration, self.two_ways)
         self.final = FinalFit(
             articulated, self.registration, self.part_frames, self.common_shape, inference.proportions
         )
@@ -280,54 +278,10 @@ class PoseEstimator:
         else:
             chosen, other, margin = self._best(self._candidates(points, num_points, registers))
         if dense is not None and self.two_ways.learnt:
-            chosen, other, margin = self._decided(chosen, points, dense, registers, self.two_ways.surface)
+            chosen, other, margin = self.decision.by_relief(chosen, points, dense, registers, self.two_ways.surface)
         elif dense is not None and self.two_ways.surface is not None:
-            chosen, other, margin = self._preferred(chosen, other, margin, points, dense, registers)
+            chosen, other, margin = self.decision.by_surface(chosen, other, margin, points, dense, registers)
         return chosen, other, margin, votes
-
-    def _decided(
-        self,
-        one: Hypotheses,  # H = 1
-        points: Tensor,  # [B, N, 3]
-        dense: Tensor,  # [B, P, 3]
-        registers: bool,
-        surface: SurfaceDecision | None = None,
-    ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
-        """Of the two explanations of clouds the one that their relief favours, the other, and by how much.
-
-        Args:
-            surface: Has a say, too.
-        """
-        twin, temperature = self._twin(one, points, registers), 1.0
-        odds = self.two_ways.relief_odds(self._relief(one, dense), self._relief(twin, dense))
-        if surface is not None:
-            odds, temperature = odds + surface.log_odds(frames_of(one, twin), dense), surface.temperature
-        return likelier(odds, one, twin, temperature)
-
-    def _preferred(
-        self,
-        one: Hypotheses,  # H = 1
-        rival: Hypotheses,  # H = 1
-        margin: Tensor,  # [B]
-        points: Tensor,  # [B, N, 3]
-        dense: Tensor,  # [B, P, 3]
-        registers: bool,
-    ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
-        """See `_decided`: of explanations and their rivals; what has no rival stays as it is.
-
-        A rival that is preferred fitted worse, mostly as its joints got stuck: it is registered again from others.
-        """
-        frames = frames_of(one, rival)
-        surface = self.two_ways.surface
-        chosen, other, decided = likelier(surface.log_odds(frames, dense), one, rival, surface.temperature)
-        alone = (frames[:, 0] == frames[:, 1]).flatten(1).all(dim=1)
-        stuck = (chosen.base != one.base).flatten(1).any(dim=1).nonzero()[:, 0]
-        if registers and len(stuck):
-            freed = self.registration.freed(chosen.rows(stuck), points[stuck])
-            chosen = chosen.at(
-                chosen.base.index_copy(0, stuck, freed.base), chosen.state.index_copy(0, stuck, freed.state)
-            )
-        return chosen, other, torch.where(alone, margin, decided)
 
     def _best(self, candidates: Candidates) -> tuple[Hypotheses, Hypotheses, Tensor]:
         """The best candidate of every cloud, its rival, and the margin between them [B].
@@ -352,13 +306,9 @@ class PoseEstimator:
         num_points: int,
         dense: Sequence[Tensor],  # of [B, P, 3] the same clouds with all their points
     ) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:  # [B, 2, 3, 3], of [B, F], [B, F]
-        """From which `two_ways` learns to decide: the frames of predictions and of their twins (object -> camera).
-
-        And the relief of both, in each of `dense`.
-        """
+        """From which `two_ways` learns to decide: see `Decision.reliefs`, of predictions."""
         chosen, _, _ = self._best(self._candidates(points, num_points, registers=True))
-        twin = self._twin(chosen, points, registers=True)
-        return frames_of(chosen, twin), [(self._relief(chosen, some), self._relief(twin, some)) for some in dense]
+        return self.decision.reliefs(chosen, points, dense)
 
     def _candidates(
         self,
@@ -439,29 +389,6 @@ class PoseEstimator:
         chosen = better(first, error[:, 0], self._candidates(points, num_points, True, turn), turn)
         return chosen, rival, margin, votes
 
-    def _twin(
-        self,
-        one: Hypotheses,  # H = 1
-        points: Tensor,  # [B, N, 3]
-        registers: bool,
-    ) -> Hypotheses:
-        """The other explanation of clouds that have two, registered or as it follows from the one."""
-        pose = self.two_ways.twin_poses(one.object_pose()[:, 0])
-        state = one.articulated_shape().read_states(pose)
-        start = one.at(pose[:, None, one.chain.root], state[:, None])
-        if not registers:
-            return start
-        base, state, _ = self.registration.register(start, points)
-        return one.at(base, state)
-
-    def _relief(
-        self,
-        one: Hypotheses,  # H = 1
-        dense: Tensor,  # [B, P, 3]
-    ) -> Tensor:  # [B, K * NUM_FEATURES]
-        """The relief of clouds under an explanation of each (`describe_relief`)."""
-        return relief_of(one, self.articulated.category.canonical().shape, dense)
-
     @torch.no_grad()
     def search(
         self,
@@ -491,7 +418,7 @@ class PoseEstimator:
                 return self._packaged(found, points, margin, votes), self.final.distance(found, points)
             found, other, margin = self._best(self.final.search(points))
             if dense is not None and self.two_ways.learnt:
-                found, other, margin = self._decided(found, points, dense, registers=True)
+                found, other, margin = self.decision.by_relief(found, points, dense, registers=True)
             return self._fitted(found, other, margin, points, dense)
 
     def _fitted(

@@ -144,7 +144,7 @@ def test_the_decision_is_taught_with_noise_of_every_strength(module, clouds, mon
 
     monkeypatch.setattr(explanations, "FEWEST", 1)
     monkeypatch.setattr(module.two_ways, "learn_twin", lambda *_: True)
-    monkeypatch.setattr(module.estimator, "_relief", relief)
+    monkeypatch.setattr(module.estimator.decision, "relief", relief)
     learn_two_ways(module, clouds)
     clean, twin, noisy, noisy_twin = seen
     assert clean is twin and torch.equal(clean, clouds) and noisy is noisy_twin
