@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import se3
 from articulate_ssl.inference.prediction import Prediction
+from articulate_ssl.ops.progress import tell
 
 FEWEST = 60  # clouds from which it is learnt
 _CAMERA_MIRROR = (-1.0, 1.0, 1.0)  # left and right of a camera that is held upright change places
@@ -72,8 +73,8 @@ class Handedness(nn.Module):
         far = _OUTLYING * ratio.abs().median()
         mean, deviation, share = two_kinds(ratio.clamp(-far, far))
         distance = float(2 * mean / deviation)
-        log.info(
-            "in the mirror: two kinds of clouds %.1f deviations apart, %.0f %% the mirrored", distance, 100 * share
+        tell(
+            log, "in the mirror: two kinds of clouds %.1f deviations apart, %.0f %% the mirrored", distance, 100 * share
         )
         if distance < _LEAST_DISTANCE or share < _LEAST_SHARE:
             return

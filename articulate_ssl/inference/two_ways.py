@@ -33,6 +33,7 @@ from torch import Tensor
 
 from articulate_ssl.geometry.se3 import invert_se3, se3
 from articulate_ssl.inference.surface_decision import WithSurface
+from articulate_ssl.ops.progress import tell
 
 _ALIKE = np.radians(25)  # rotations closer than this are the same twin
 # Of the clouds, that must have the same twin; and by how much their two explanations may differ in fit. Chosen.
@@ -103,14 +104,14 @@ class TwoWays(WithSurface):
         difference = -(1 - margin[close].double()).log()
         difference = difference.clamp(max=_OUTLYING * difference.median())
         if (kurtosis := _kurtosis(difference.cpu().numpy())) < _UNDECIDED:
-            log.info("fits part the two explanations themselves (kurtosis %.2f)", kurtosis)
+            tell(log, "fits part the two explanations themselves (kurtosis %.2f)", kurtosis)
             return False
         chosen, rival = chosen[close].double(), rival[close].double()
         # Whose twin is whose is open: both ways are examples.
         here, there = torch.cat([chosen, rival]), torch.cat([rival, chosen])
         found = max((_consensus(here, there, slot) for slot in _involutions(chosen.shape[1])), key=lambda one: one[0])
         share, slot, turn = found
-        log.info("%.0f %% of the clouds that fit in two ways have the same twin", 100 * share)
+        tell(log, "%.0f %% of the clouds that fit in two ways have the same twin", 100 * share)
         if share * float(close.double().mean()) < _COMMON:
             return False
         self.slot.copy_(torch.tensor(slot))
@@ -151,7 +152,7 @@ def decision_direction(
         weight = _agreeing(differences, np.sign(white @ _least_kurtosis(white, generator)))
         if (kurtosis := _kurtosis(differences @ weight)) < least:
             least, best = kurtosis, weight
-    log.info("the two explanations part with a kurtosis of %.2f (1: perfectly, 3: not at all)", least)
+    tell(log, "the two explanations part with a kurtosis of %.2f (1: perfectly, 3: not at all)", least)
     return best
 
 

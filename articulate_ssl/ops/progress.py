@@ -53,6 +53,15 @@ def announced(log: logging.Logger, work: str, items: Sequence[Item]) -> Iterator
     announce(log, Stage(work, "", len(items), len(items)))
 
 
+def tell(log: logging.Logger, message: str, *values: object) -> None:
+    """Tell listeners what work has found: a line that stays, while details go with the work that they are of.
+
+    Args:
+        values: As of `logging`.
+    """
+    log.info(message, *values, extra={"stays": True})
+
+
 @dataclass
 class _Shown:
     """A work that is under way: when it began, when a line was last written, its task on the display."""
@@ -64,7 +73,7 @@ class _Shown:
 
 
 class Listener(logging.Handler):
-    """Shows what is announced, and writes warnings out.
+    """Shows what is announced, and writes out what was found, and warnings.
 
     Args:
         display: Gives the rich display that is on the screen, None where there is none.
@@ -83,7 +92,7 @@ class Listener(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """One record of the package's loggers."""
         stage: Stage | None = getattr(record, "stage", None)
-        if record.levelno >= logging.WARNING:
+        if record.levelno >= logging.WARNING or getattr(record, "stays", False):
             _write(record.getMessage())
         elif stage is not None:
             self._show(stage)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from articulate_ssl.inference.prediction import Prediction, concatenate
 from articulate_ssl.inference.two_ways import FEWEST
-from articulate_ssl.ops.progress import announced
+from articulate_ssl.ops.progress import announced, tell
 from articulate_ssl.shape.object_axes import object_axes
 from articulate_ssl.training.surface_lessons import learn_surface
 
@@ -43,7 +43,9 @@ def learn_two_ways(
     Either way, a network is taught by what decides so far, relief or fits.
     """
     if len(clouds) < FEWEST:
-        log.info("no decision between two explanations: it takes %d training clouds, there are %d", FEWEST, len(clouds))
+        tell(
+            log, "no decision between two explanations: it takes %d training clouds, there are %d", FEWEST, len(clouds)
+        )
         return
     two_ways = module.estimator.two_ways
     two_ways.surface = None  # of a run that ended and goes on
@@ -51,7 +53,7 @@ def learn_two_ways(
     if two_ways.learn_twin(_object_poses(chosen), _object_poses(rival), chosen.margin):
         _learn_from_relief(module, clouds)
     else:
-        log.info("the collection has no say in which explanation is right: fits differ, or rivals from cloud to cloud")
+        tell(log, "the collection has no say in which explanation is right: fits differ, or rivals from cloud to cloud")
         _learn_from_fits(module, clouds, chosen, rival)
 
 

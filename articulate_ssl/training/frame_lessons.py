@@ -17,7 +17,7 @@ from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.inference.part_frames import WINDOWS, Faces, faces_of
 from articulate_ssl.inference.proportions import descended
 from articulate_ssl.network.hypotheses import Hypotheses, concatenated
-from articulate_ssl.ops.progress import announced
+from articulate_ssl.ops.progress import announced, tell
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.fusion import fused
 from articulate_ssl.shape.object_axes import object_axes
@@ -58,7 +58,7 @@ def learn_part_frames(
     quality = frames.learn(explained, every, start)
     for part, (share, angle) in enumerate(quality.tolist()):
         flat = "has" if frames.flat[part] else "has no"
-        log.info("part %d %s faces: %.0f %% of clouds alike, %.1f degrees", part, flat, 100 * share, angle)
+        tell(log, "part %d %s faces: %.0f %% of clouds alike, %.1f degrees", part, flat, 100 * share, angle)
     if frames.learnt and not estimator.observation.orientation.limited:
         rows = torch.arange(min(_CLOUDS, len(clouds)), device=clouds.device)
         _learn_common_shape(module, explained.rows(rows), clouds[rows])

@@ -20,7 +20,7 @@ from torch import Tensor
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.inference.hinge_sides import Bodies
 from articulate_ssl.inference.prediction import Prediction
-from articulate_ssl.ops.progress import announced
+from articulate_ssl.ops.progress import announced, tell
 from articulate_ssl.training.explanations import registered_points, with_noise
 from articulate_ssl.training.surface_lessons import FEWEST, TAUGHT, Lessons, believable, teach
 
@@ -65,7 +65,7 @@ def learn_hinge_sides(
         return
     predictions = _predictions(module, clouds[:_FIRST])
     if _bodies(module, clouds[:_FIRST], predictions).known.double().mean() < _KNOWN:
-        log.info("hinge sides: too little is seen behind the closed door")
+        tell(log, "hinge sides: too little is seen behind the closed door")
         return
     predictions += _predictions(module, clouds[_FIRST:])
     for whole in (False, True):
@@ -89,7 +89,7 @@ def _learn_upright(module: ArticulatedPoseModule, views: Tensor) -> None:
     if sides.camera.learnt:
         _, quarters, stand = sides.camera.stood(rotation)
         other, undecided = float((quarters > 0).double().mean()), float((~stand).double().mean())
-        log.info("hinge sides, by an upright camera: %.0f %% lie, undecided %.0f %%", 100 * other, 100 * undecided)
+        tell(log, "hinge sides, by an upright camera: %.0f %% lie, undecided %.0f %%", 100 * other, 100 * undecided)
         sides.learnt.fill_(_LEAST_TURNED <= other <= _MOST_TURNED and undecided <= _MOST_UNDECIDED)
     if not sides.learnt:
         sides.camera.forget()
@@ -117,7 +117,7 @@ def _learnt(module: ArticulatedPoseModule, bodies: Bodies) -> bool:
     best = believed.topk(2, dim=1).values
     undecided, other = float((best[:, 0] - best[:, 1] < _DECIDED).double().mean()), float(1 - share[0])
     percent = (100 * share).round().int().tolist()
-    log.info("hinge sides, by %s: %s %% of the clouds, undecided %.0f %%", seen, percent, 100 * undecided)
+    tell(log, "hinge sides, by %s: %s %% of the clouds, undecided %.0f %%", seen, percent, 100 * undecided)
     sides.log_prior.zero_()
     sides.log_prior[: len(share)] = share.log()
     # As surely as what is predicted is right, which most is.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from articulate_ssl.ops.progress import announced
+from articulate_ssl.ops.progress import announced, tell
 from articulate_ssl.training.explanations import registered_points
 
 if TYPE_CHECKING:
@@ -38,3 +38,5 @@ def learn_joint_limits(
         prediction = estimator.predict(some[:, : registered_points(module)], module.num_points, dense=some)
         found.append(prediction.joint_state + sides.closed * sides.learnt)
     states.learn(torch.cat(found), module.hparams["state_range"])
+    for joint, (low, high) in enumerate(states.seen.rad2deg().tolist()):
+        tell(log, "joint %d: states from %.0f to %.0f degrees", joint, low, high)

@@ -16,7 +16,7 @@ from articulate_ssl.inference.confidence import relative_error
 from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.metrics.functional import ABOVE_DEG
 from articulate_ssl.ops.farthest_point import farthest_point_order
-from articulate_ssl.ops.progress import announced
+from articulate_ssl.ops.progress import announced, tell
 from articulate_ssl.training.set_clouds import SetClouds
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def look_twice(
         first, second = (module.predict_points(p, dense=whole) for p, whole in zip(points, (some, again), strict=True))
         found.append((relative_error(first, points[0]), first.margin, agree(first, second, points, turn)))
     error, margin, agrees = (torch.cat(values) for values in zip(*found, strict=True))
-    log.info("%d of %d training clouds are predicted alike a second time", int(agrees.sum()), len(agrees))
+    tell(log, "%d of %d training clouds are predicted alike a second time", int(agrees.sum()), len(agrees))
     return error, margin, agrees
 
 

@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from articulate_ssl.inference.surface_decision import SIZE, SurfaceDecision
 from articulate_ssl.network.surface_network import SurfaceCloud, SurfaceSize
-from articulate_ssl.ops.progress import announced
+from articulate_ssl.ops.progress import announced, tell
 from articulate_ssl.ops.spin_images import SPIN_CHANNELS, spin_images
 
 # Chosen on training objects that were left out and on development objects (steps 109 and 112 of docs/experiments.md).
@@ -100,7 +100,7 @@ def learn_surface(
     """
     taught, rest = order.split([count := int(TAUGHT * len(order)), len(order) - count])
     if len(taught) < FEWEST:
-        log.info("no network decides: that takes %d clouds to teach it, there are %d", FEWEST, len(taught))
+        tell(log, "no network decides: that takes %d clouds to teach it, there are %d", FEWEST, len(taught))
         return None
     decision = teach(Lessons.of([clouds[taught] for clouds in versions], frames[taught]))
     said = torch.cat(
@@ -110,7 +110,7 @@ def learn_surface(
         ]
     )
     agrees = float((said.argmax(dim=1) == 0).double().mean())
-    log.info("a network taught by %d clouds says of %.0f %% of the others what taught it", len(taught), 100 * agrees)
+    tell(log, "a network taught by %d clouds says of %.0f %% of the others what taught it", len(taught), 100 * agrees)
     if agrees < least:
         log.warning("that is too few: no network decides")
         return None

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from articulate_ssl.ops import progress
-from articulate_ssl.ops.progress import Listener, Stage, announce, announced, listening
+from articulate_ssl.ops.progress import Listener, Stage, announce, announced, listening, tell
 
 log = logging.getLogger("articulate_ssl.toy")
 
@@ -66,6 +66,16 @@ def test_warnings_are_written_and_other_messages_only_beside_work(capsys):
         log.info("whatever")
         log.warning("a wheel came off")
     assert capsys.readouterr().err == "a wheel came off\n"
+
+
+def test_what_was_found_is_written_whenever_it_is_told(display, capsys):
+    with listening(Listener(lambda: None)):
+        tell(log, "%d toys", 3)
+    with listening(Listener(lambda: display)):
+        announce(log, Stage("toys", "first half", 0, 2))
+        tell(log, "%d more", 4)
+        assert display.tasks[0].description == "toys: first half"
+    assert capsys.readouterr().err == "3 toys\n4 more\n"
 
 
 def test_logging_is_left_as_it_was():
