@@ -71,7 +71,7 @@ ABLATIONS = (
     ),
     Ablation("relief and that network", lambda of: bool(of.two_ways.learnt), _no_decision),
     Ablation(
-        "the network that decides which way round", lambda of: of.sliding.surface is not None, _no_network_of_turns
+        "the network that chooses among leading turns", lambda of: of.sliding.surface is not None, _no_network_of_turns
     ),
     Ablation("the search in the collection", lambda of: of.sliding.learnt, lambda of: of.sliding.forget()),
     Ablation("the search among simulated views", lambda of: of.view_search.learnt, lambda of: of.view_search.forget()),
