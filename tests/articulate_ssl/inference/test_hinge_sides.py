@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import roma
@@ -315,6 +316,34 @@ def test_some_that_lie_are_learnt(box_module, monkeypatch, share, learnt):
         assert sides.log_prior.argmax() == 0
     else:
         assert sides.surface is None
+
+
+def _seen_by_an_upright_camera(lying: torch.Tensor) -> torch.Tensor:
+    """Base poses [n, 4, 4] of objects that turn about their vertical, some of which are explained lying."""
+    turn = torch.rand(len(lying), 1, generator=torch.Generator().manual_seed(1)) - 0.5
+    azimuth = roma.rotvec_to_rotmat(2 * turn * torch.tensor([0.0, 1.0, 0.0]))
+    lies = roma.rotvec_to_rotmat(lying[:, None] * QUARTER * torch.tensor([0.0, 0.0, 1.0]))
+    return se3(azimuth @ lies, torch.zeros(len(lying), 3))
+
+
+@pytest.mark.parametrize(("share", "learnt"), [(0.12, True), (0.0, False), (0.6, False)], ids=["some", "none", "most"])
+def test_an_upright_camera_needs_no_network(monkeypatch, share, learnt):
+    lying = (torch.rand(200, generator=torch.Generator().manual_seed(2)) < share).float()
+    poses, known = _seen_by_an_upright_camera(lying), _sides()
+    module = tiny_module(num_parts=2, orientation_range=100.0).eval()
+    monkeypatch.setattr(hinge_lessons, "FEWEST", 20)
+    monkeypatch.setattr(hinge_lessons, "_predictions", lambda *_: [SimpleNamespace(base_pose=poses)])
+    monkeypatch.setattr(hinge_lessons, "teach", None)
+    monkeypatch.setattr(HingeSides, "measure", lambda self, *_: self.axes.copy_(known.axes))
+    learn_hinge_sides(module, torch.zeros(200, POINTS, 3))
+    sides = module.hinge_sides
+    assert bool(sides.learnt) == bool(sides.camera.learnt) == learnt
+    if learnt:
+        prediction, _, _ = _lying([0, 0])
+        rows = torch.tensor([int(lying.argmin()), int(lying.argmax())])
+        stood, quarters = sides.decided(replace(prediction, base_pose=poses[rows]), None)
+        assert quarters.tolist() == [0, 3]
+        torch.testing.assert_close(stood.base_pose[:, :3, 1], torch.tensor([[0.0, 1.0, 0.0]] * 2), atol=1e-5, rtol=0)
 
 
 def test_nothing_is_learnt_where_too_little_is_seen(box_module, monkeypatch):
