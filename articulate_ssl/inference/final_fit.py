@@ -20,6 +20,7 @@ from articulate_ssl.inference.common_shape import CommonShape
 from articulate_ssl.inference.hypothesis_registration import HypothesisRegistration
 from articulate_ssl.inference.part_frames import PartFrames
 from articulate_ssl.inference.proportions import fit_proportions
+from articulate_ssl.inference.view_search import ViewSearch
 from articulate_ssl.network.articulated_network import ArticulatedNetwork
 from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.ops.chamfer import chamfer
@@ -37,6 +38,7 @@ class FinalFit:
         registration: Of hypotheses; says which joint states there are.
         part_frames: How the faces of parts lie.
         common_shape: What training clouds have in common.
+        view_search: Simulated views, if there are any, know better than limits which way round objects are.
         cycles: Of descent; 0 leaves proportions out.
     """
 
@@ -46,10 +48,12 @@ class FinalFit:
         registration: HypothesisRegistration,
         part_frames: PartFrames,
         common_shape: CommonShape,
+        view_search: ViewSearch,
         cycles: int,
     ) -> None:
         self.articulated, self.registration = articulated, registration
-        self.part_frames, self.common_shape, self.cycles = part_frames, common_shape, cycles
+        self.part_frames, self.common_shape = part_frames, common_shape
+        self.view_search, self.cycles = view_search, cycles
 
     @property
     def fits(self) -> bool:
@@ -90,15 +94,12 @@ class FinalFit:
         margin: Tensor,  # [B]
         points: Tensor,  # [B, N, 3]
         dense: Tensor | None,  # [B, P, 3]
-        turns: bool = True,
     ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
         """Explanations in the clouds' proportions; those whose joints are where none was seen give way to others.
 
         These are the same from other joint states, rivals, and what a search finds with the category's shape, if they
-        are within what was seen and explain a cloud about as well. Nothing is sure then, so the margin is 0.
-
-        Args:
-            turns: Others may be turned another way. Simulated views know better which way round an object is.
+        are within what was seen and explain a cloud about as well. Nothing is sure then, so the margin is 0. Where
+        simulated views said which way round objects are, it is only the former.
         """
         fitted = self.in_proportion(one, points, dense)
         out = (~self._within(fitted)).nonzero()[:, 0]
@@ -106,7 +107,7 @@ class FinalFit:
             return fitted, rival, margin
         own, seen, before = points[out], None if dense is None else dense[out], one.rows(out)
         least = ABOUT_AS_WELL * self.distance(fitted, points)[out]
-        others = ((rival.rows(out), False), (self._searched(own), False)) if turns else ()
+        others = () if self.view_search.learnt else ((rival.rows(out), False), (self._searched(own), False))
         for start, same in ((before, True), *others):
             tried = self.in_proportion(self.registration.freed(start, own), own, seen)
             error = self.distance(tried, own)

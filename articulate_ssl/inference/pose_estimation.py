@@ -117,7 +117,12 @@ class PoseEstimator:
         self.registration = HypothesisRegistration(inference, self.observation, self.states)
         self.decision = Decision(articulated, self.registration, self.two_ways)
         self.final = FinalFit(
-            articulated, self.registration, self.part_frames, self.common_shape, inference.proportions
+            articulated,
+            self.registration,
+            self.part_frames,
+            self.common_shape,
+            self.view_search,
+            inference.proportions,
         )
 
     @property
@@ -227,7 +232,7 @@ class PoseEstimator:
             chosen, other, margin, votes = self._chosen(points, num_points, registers, dense)
             error = self.final.distance(chosen, points)
             if registers and fits:
-                chosen, other, margin = self._within_limits(chosen, other, margin, points, dense)
+                chosen, other, margin = self.final.within_limits(chosen, other, margin, points, dense)
             rival = self._packaged(other, points, torch.zeros_like(margin))
             return self._packaged(chosen, points, margin, votes), rival, error
 
@@ -431,19 +436,8 @@ class PoseEstimator:
         votes: Tensor | None = None,  # [B, N, K]
     ) -> tuple[Prediction, Tensor]:
         """Explanations in the clouds' proportions, packaged; and their errors [B] before that."""
-        shown, _, margin = self._within_limits(one, rival, margin, points, dense)
+        shown, _, margin = self.final.within_limits(one, rival, margin, points, dense)
         return self._packaged(shown, points, margin, votes), self.final.distance(one, points)
-
-    def _within_limits(
-        self,
-        one: Hypotheses,  # H = 1
-        rival: Hypotheses,  # H = 1
-        margin: Tensor,  # [B]
-        points: Tensor,  # [B, N, 3]
-        dense: Tensor | None,  # [B, P, 3]
-    ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
-        """See `FinalFit.within_limits`; simulated views know better than limits which way round objects are."""
-        return self.final.within_limits(one, rival, margin, points, dense, turns=not self.view_search.learnt)
 
     def _packaged(
         self,

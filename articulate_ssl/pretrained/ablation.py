@@ -94,7 +94,7 @@ class Study:
         weights: Which.
         seed: Of the data.
         samples: Test clouds, at most, spread over objects and states.
-        build: Folder for data and results; what is finished there is not repeated.
+        build: Folder for data and results; what is finished there is not repeated, even if the code has changed.
     """
 
     weights: ShippedWeights
@@ -128,9 +128,7 @@ class Study:
             return known["metrics"]
         module = load_module(self.weights.file)
         ablation.forget(module.estimator)
-        data = data_of(card, place / "data", module.num_points)
-        data.hparams.max_test_samples = self.samples
-        metrics = tested(module, data, place)
+        metrics = tested(module, data_of(card, place / "data", module.num_points, self.samples), place)
         with atomic_write(note) as file:
             file.write(json.dumps({"of": about, "metrics": metrics}).encode())
         return metrics

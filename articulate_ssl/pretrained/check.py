@@ -153,15 +153,15 @@ def make_data(card: WeightsCard, seed: int, place: Path) -> None:
         raise CheckpointError(f"{place}: the data could not be made (exit code {code}); {log} says why")
 
 
-def data_of(card: WeightsCard, root: Path, num_points: int) -> ArticulatedDataModule:
-    """Data as the card's are, in a folder that `render.generate` wrote to."""
+def data_of(card: WeightsCard, root: Path, num_points: int, samples: int | None = None) -> ArticulatedDataModule:
+    """Data as the card's are, in a folder that `render.generate` wrote to; test clouds are as many, or `samples`."""
     return ArticulatedDataModule(
         card.category,
         root=str(root),
         view="complete" if card.view == "complete" else "partial",
         num_points=num_points,
         batch_size=_BATCH,
-        max_test_samples=card.metrics["samples"],
+        max_test_samples=samples or card.metrics["samples"],
     )
 
 

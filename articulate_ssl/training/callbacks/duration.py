@@ -12,8 +12,8 @@ from torch import Tensor
 
 MEASURED_STEPS = 20  # of training, before the estimate is corrected; chosen: some seconds with the `cpu` profile
 _WARM_SECONDS = 5.0  # a first step that takes as long says enough; a shorter one may have been mostly start-up
-# Which of them apply is not known before. Of 1,000 ovens they took as long as all before (docs/experiments.md, 156).
-_LESSONS = "then its lessons, without labels, which may take as long again"
+# Which of them apply is not known before. Of 1,000 ovens they took twice as long as all before (log, step 156).
+_LESSONS = "then its lessons, without labels, which may take twice as long"
 _UNITS = ((2 * 86400, 86400, "days"), (2 * 3600, 3600, "hours"), (100, 60, "minutes"), (0, 1, "seconds"))
 
 

@@ -16,6 +16,7 @@ from articulate_ssl.inference.hypothesis_registration import HypothesisRegistrat
 from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.inference.part_frames import PartFrames
 from articulate_ssl.inference.state_range import StateRange
+from articulate_ssl.inference.view_search import ViewSearch
 from articulate_ssl.network.heads.shape import CanonicalShape
 from articulate_ssl.network.heads.structure import Structure
 from articulate_ssl.network.hypotheses import Hypotheses
@@ -58,7 +59,7 @@ def final(data) -> FinalFit:
     options = InferenceOptions(refine=True, proportions=6)
     registration = HypothesisRegistration(options, Observation(), states)
     network = _Network(replace(shape, points=shape.points[order], label=shape.label[order]))
-    return FinalFit(network, registration, PartFrames(2), CommonShape(2), options.proportions)
+    return FinalFit(network, registration, PartFrames(2), CommonShape(2), ViewSearch(2), options.proportions)
 
 
 def _at(final: FinalFit, data, state: torch.Tensor) -> Hypotheses:
@@ -94,7 +95,8 @@ def test_a_rival_within_limits_takes_the_place_of_what_is_not(final, data, monke
     torch.testing.assert_close(shown.state[:, 0], data.state, atol=0.1, rtol=0)
     assert torch.equal(other.state, start.state) and (margin == 0).all()
     # Unless it was known which way round the object is.
-    kept, other, margin = final.within_limits(start, rival, torch.ones(4), data.points, None, turns=False)
+    monkeypatch.setattr(final, "view_search", SimpleNamespace(learnt=True))
+    kept, other, margin = final.within_limits(start, rival, torch.ones(4), data.points, None)
     assert torch.equal(kept.state, final.in_proportion(start, data.points, None).state)
     assert other is rival and (margin == 1).all()
 
