@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from articulate_ssl.geometry.kinematic_chain import KinematicChain, extract_chain, pair_index
+from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.ops.farthest_point import farthest_point_order
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.joints import Joints, pair_of_joints
@@ -102,6 +103,18 @@ class CategoryObject(nn.Module):
     def follow(self, confidence: Tensor, weight: float) -> None:
         """Draw the running mean to the confidences [B, E] of a batch."""
         self.mean_confidence.lerp_(confidence.mean(dim=0), weight)
+
+    @torch.no_grad()
+    def move_lines(
+        self,
+        shift: Tensor,  # [J, 3]
+        state: Tensor,  # [J] radians
+    ) -> None:
+        """Let joints turn about lines elsewhere; at `state` all parts stay where they are."""
+        joints = self.articulated_shape(REVOLUTE).joints
+        moved, displaced = joints.with_lines_moved(shift, state)
+        self.pivot[pair_of_joints(joints.chain, self.pairs)] = moved.pivot
+        self.assembly += displaced
 
     @torch.no_grad()
     def adopt(self, shape: ArticulatedShape) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import roma
 import torch
 from torch import Tensor
 
@@ -52,6 +53,23 @@ class Joints:
     ) -> Tensor:  # [..., K, 4, 4]
         """Canonical object space -> camera space of every part."""
         return base[..., None, :, :] @ self.articulation(state)
+
+    def with_lines_moved(
+        self,
+        shift: Tensor,  # [J, 3]
+        state: Tensor,  # [J] radians
+    ) -> tuple[Joints, Tensor]:  # , [K, 3]
+        """Joints that turn about lines elsewhere, and by how much parts are displaced with them.
+
+        Displaced so in canonical object space, all parts are at `state` where they were before.
+        """
+        displaced = shift.new_zeros(self.chain.num_parts, 3)
+        pivot = self.pivot.clone()
+        for j, (parent, child) in enumerate(zip(self.chain.parent, self.chain.child, strict=True)):
+            back = roma.rotvec_to_rotmat(-state[j] * self.axis[j])
+            pivot[j] += shift[j] + displaced[parent]
+            displaced[child] = displaced[parent] + shift[j] - back @ shift[j]
+        return replace(self, pivot=pivot), displaced
 
     def clamped(
         self,

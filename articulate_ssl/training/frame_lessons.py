@@ -1,6 +1,7 @@
 """What `inference.part_frames` and `inference.common_shape` are learnt from: predictions of training clouds.
 
-How the faces of their parts lie, and then, where these say how clouds are turned, what they have in common.
+How the faces of their parts lie; then, of complete clouds, where joint lines are (`line_lessons`), and where faces say
+how clouds are turned, what they have in common.
 """
 
 from __future__ import annotations
@@ -16,13 +17,14 @@ from trimesh.bounds import oriented_bounds
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.inference.part_frames import WINDOWS, Faces, faces_of
 from articulate_ssl.inference.proportions import descended
-from articulate_ssl.network.hypotheses import Hypotheses, concatenated
-from articulate_ssl.ops.progress import announced, tell
+from articulate_ssl.network.hypotheses import Hypotheses
+from articulate_ssl.ops.progress import tell
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.fusion import fused
 from articulate_ssl.shape.object_axes import object_axes
 from articulate_ssl.shape.part_maps import PartMaps
 from articulate_ssl.training.explanations import registered_points
+from articulate_ssl.training.line_lessons import explain, learn_joint_lines
 
 if TYPE_CHECKING:
     from articulate_ssl.training.module import ArticulatedPoseModule
@@ -39,29 +41,34 @@ def learn_part_frames(
     module: ArticulatedPoseModule,
     clouds: Tensor,  # [n, N, 3] farthest-point order, dense
 ) -> None:
-    """Find out which parts have faces that say how they are turned, and then which shape clouds have in common.
+    """Find out which parts have faces that say how they are turned, then where joint lines are and what is common.
 
-    The latter of complete clouds alone.
+    The latter two of complete clouds alone.
     """
-    estimator, count = module.estimator, registered_points(module)
+    estimator = module.estimator
     frames = estimator.part_frames
     frames.flat.fill_(False)
     estimator.common_shape.forget()
-    found, faces = [], []
-    for some in announced(log, "faces of parts", clouds.split(_BATCH)):
-        found.append(estimator.explained(some[:, :count], module.num_points, some))
-        faces.append([faces_of(found[-1], some, [window] * module.num_parts) for window in WINDOWS])
+    explained = explain(module, clouds, "faces of parts")
+    rows = torch.arange(len(clouds), device=clouds.device).split(_BATCH)
+    faces = [
+        [faces_of(explained.rows(some), clouds[some], [window] * module.num_parts) for window in WINDOWS]
+        for some in rows
+    ]
     every = tuple(Faces(*map(torch.cat, zip(*seen, strict=True))) for seen in zip(*faces, strict=True))
     network = module.articulated
     start = rough_axes(network.category.articulated_shape(network.joint_type))
-    explained = concatenated(found)
     quality = frames.learn(explained, every, start)
     for part, (share, angle) in enumerate(quality.tolist()):
         flat = "has" if frames.flat[part] else "has no"
         tell(log, "part %d %s faces: %.0f %% of clouds alike, %.1f degrees", part, flat, 100 * share, angle)
-    if frames.learnt and not estimator.observation.orientation.limited:
-        rows = torch.arange(min(_CLOUDS, len(clouds)), device=clouds.device)
-        _learn_common_shape(module, explained.rows(rows), clouds[rows])
+    if estimator.observation.orientation.limited:
+        return
+    few = slice(_CLOUDS)
+    explained = explained.rows(torch.arange(len(clouds), device=clouds.device)[few])
+    explained = learn_joint_lines(module, explained, clouds[few])
+    if frames.learnt:
+        _learn_common_shape(module, explained, clouds[few])
 
 
 def _learn_common_shape(module: ArticulatedPoseModule, explained: Hypotheses, clouds: Tensor) -> None:
