@@ -11,6 +11,9 @@ from torch import Tensor
 from articulate_ssl.geometry.kinematic_chain import KinematicChain, forward_kinematics
 from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE, screw_motion
 from articulate_ssl.geometry.se3 import se3, transform_points
+from articulate_ssl.network.heads.shape import CanonicalShape
+from articulate_ssl.network.heads.structure import Structure
+from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.joints import Joints
 
@@ -135,3 +138,21 @@ def true_shape(design, data: Clouds) -> ArticulatedShape:
     K = len(design[0])
     chain = KinematicChain(K, 0, design[1], tuple(range(1, K)))
     return ArticulatedShape(data.rest, data.part, Joints(chain, data.axis, data.pivot, design[4]))
+
+
+def true_hypotheses(design, data: Clouds) -> Hypotheses:
+    """The truth of every cloud as an explanation, H = 1, with every sixth point of each part."""
+    count, shape = len(data.base), true_shape(design, data)
+    parts = torch.stack(
+        [shape.part(part)[: len(shape.label) // shape.num_parts : 6] for part in range(shape.num_parts)]
+    )
+    center = parts.mean(dim=1)
+    joints, nothing = shape.joints, torch.zeros(count, len(data.axis))
+    pivot, axis = joints.pivot.expand(count, -1, -1), joints.axis.expand(count, 1, -1, -1)
+    return Hypotheses(
+        CanonicalShape(*(x.expand(count, *x.shape) for x in (parts - center[:, None], center))),
+        Structure(nothing, pivot, axis, pivot, axis, joints.chain, joints.joint_type),
+        data.base[:, None],
+        data.state[:, None],
+        torch.zeros(count, 0, shape.num_parts),
+    )

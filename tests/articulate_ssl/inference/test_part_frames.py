@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import roma
 import torch
-from articulated_objects import LAPTOP, OVEN, Clouds, clouds, true_shape
+from articulated_objects import LAPTOP, OVEN, Clouds, clouds, true_hypotheses, true_shape
 from tiny import POINTS, tiny_module
 
 from articulate_ssl.geometry.screw import screw_motion
@@ -16,7 +16,6 @@ from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.inference.part_frames import WINDOWS, Faces, PartFrames, faces_of, square_to
 from articulate_ssl.inference.proportions import fit_proportions
 from articulate_ssl.network.heads.shape import CanonicalShape
-from articulate_ssl.network.heads.structure import Structure
 from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.training import frame_lessons
 from articulate_ssl.training.frame_lessons import learn_part_frames, rough_axes
@@ -33,20 +32,13 @@ def _data(design=OVEN, count: int = 24, seed: int = 0) -> Clouds:
 def _explained(design, data: Clouds, seed: int = 1) -> Hypotheses:
     """The truth, a few degrees off: bases, states, and the joint's direction."""
     generator = torch.Generator().manual_seed(seed)
-    count, shape = len(data.base), true_shape(design, data)
-    parts = torch.stack([shape.part(part)[: DENSE // shape.num_parts : 6] for part in range(shape.num_parts)])
-    center = parts.mean(dim=1)
+    count, one = len(data.base), true_hypotheses(design, data)
     off = roma.rotvec_to_rotmat(math.radians(TURNED) * (2 * torch.rand(count, 3, generator=generator) - 1) / 3**0.5)
     base = se3(data.base[:, :3, :3] @ off, data.base[:, :3, 3])
     state = data.state + math.radians(MOVED) * (2 * torch.rand(data.state.shape, generator=generator) - 1)
-    pivot, axis = data.pivot.expand(count, -1, -1), (data.axis @ TILT.mT).expand(count, 1, -1, -1)
-    return Hypotheses(
-        CanonicalShape(*(x.expand(count, *x.shape) for x in (parts - center[:, None], center))),
-        Structure(torch.zeros(count, 1), pivot, axis, pivot, axis, shape.joints.chain, shape.joints.joint_type),
-        base[:, None],
-        state[:, None],
-        torch.zeros(count, 0, shape.num_parts),
-    )
+    axis = one.axis @ TILT.mT
+    one = replace(one, structure=replace(one.structure, axis=axis, pair_axis=axis))
+    return one.at(base[:, None], state[:, None])
 
 
 def _learnt(design, data: Clouds) -> tuple[PartFrames, torch.Tensor]:

@@ -5,6 +5,7 @@ import torch
 
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.screw import REVOLUTE
+from articulate_ssl.geometry.se3 import transform_points
 from articulate_ssl.network.articulated_network import ArticulatedNetwork
 from articulate_ssl.network.category_object import CategoryObject
 from articulate_ssl.network.heads.pose import PoseHead, state_anchors
@@ -61,6 +62,7 @@ def test_instances_have_the_categorys_shape_until_they_are_freed():
 @pytest.mark.parametrize(("count", "stretch"), [(1, 1.6), (4, 0.4)])
 def test_a_start_reaches_to_the_middle_of_its_neighbours_stretch(count, stretch):
     """However strongly the head pulls."""
+    torch.manual_seed(0)
     head = PoseHead(2, rotation_group(12), 1.6, NetworkOptions(head_dim=4, state_anchors=count))
     chain = CategoryObject(2, 8).chain()
     for one in head.state:
@@ -69,3 +71,22 @@ def test_a_start_reaches_to_the_middle_of_its_neighbours_stretch(count, stretch)
     away = state - state_anchors(count, 1, 1.6)[:, 0]
     assert away.abs().amax() <= stretch + 1e-6
     assert away.amax() > 0.9 * stretch and away.amin() < -0.9 * stretch
+
+
+def test_lines_that_move_leave_parts_where_they_are():
+    """At the states that are given; at others they turn about the new lines."""
+    category = CategoryObject(4, 16)
+    category.start_apart()
+    category.mean_confidence.copy_(torch.tensor([1.0 if b == a + 1 else 0.0 for a, b in category.pairs.tolist()]))
+    state, shift = torch.tensor([0.5, -0.8, 0.3]), 0.1 * torch.randn(3, 3, generator=torch.Generator().manual_seed(0))
+    before, base = category.articulated_shape(REVOLUTE), torch.eye(4)[None]
+    chain = before.joints.chain
+    assert any(parent != chain.root for parent in chain.parent)  # lines move with the parts that they are on
+    category.move_lines(shift, state)
+    after = category.articulated_shape(REVOLUTE)
+    torch.testing.assert_close(after.posed(base, state[None]), before.posed(base, state[None]), atol=1e-5, rtol=0)
+    assert not torch.allclose(after.posed(base, 0 * state[None]), before.posed(base, 0 * state[None]), atol=1e-2)
+    old, new = (one.joints.part_pose(base, state[None])[0, list(chain.parent)] for one in (before, after))
+    moved = [transform_points(pose, one.joints.pivot[:, None])[:, 0] for pose, one in ((old, before), (new, after))]
+    by = (old[:, :3, :3] @ shift[..., None]).squeeze(-1)
+    torch.testing.assert_close(moved[1] - moved[0], by, atol=1e-5, rtol=0)
