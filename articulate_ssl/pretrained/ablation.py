@@ -7,7 +7,6 @@ would be learnt without it. Objects are of a data seed of their own: those of th
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from typing import Any
 
 from articulate_ssl.inference.pose_estimation import PoseEstimator
 from articulate_ssl.pretrained.check import data_of, make_data, tested
+from articulate_ssl.pretrained.fingerprint import fingerprint
 from articulate_ssl.pretrained.markdown_table import cells_of, table_of
 from articulate_ssl.training.checkpoint import load_module
 from articulate_ssl.training.shipped_weights import ShippedWeights
@@ -94,7 +94,7 @@ class Study:
         weights: Which.
         seed: Of the data.
         samples: Test clouds, at most, spread over objects and states.
-        build: Folder for data and results; what is finished there is not repeated, even if the code has changed.
+        build: Folder for data and results; what is finished there is not repeated unless weights or code change.
     """
 
     weights: ShippedWeights
@@ -122,7 +122,7 @@ class Study:
         return found
 
     def _without(self, ablation: Ablation, card: WeightsCard, place: Path) -> dict[str, Any]:
-        about = f"{hashlib.sha256(self.weights.file.read_bytes()).hexdigest()}, {self.samples} clouds"
+        about = fingerprint(self.weights.file, self.samples)
         note = place / f"without {ablation.name}.json"
         if note.is_file() and (known := json.loads(note.read_text()))["of"] == about:
             return known["metrics"]

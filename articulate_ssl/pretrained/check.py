@@ -8,7 +8,6 @@ test objects, for which the bootstrap is too narrow, more do.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import math
@@ -26,6 +25,7 @@ from scipy.stats import binom
 
 from articulate_ssl.inference.checkpoint_file import CheckpointError
 from articulate_ssl.metrics.report import JSON_NAME
+from articulate_ssl.pretrained.fingerprint import fingerprint
 from articulate_ssl.training.checkpoint import load_module
 from articulate_ssl.training.module import ArticulatedPoseModule
 from articulate_ssl.training.shipped_weights import ShippedWeights
@@ -85,15 +85,15 @@ def check(
     """
     card = WeightsCard.load(weights.file.with_suffix(CARD_SUFFIX))
     place = build / f"{weights.name}-seed-{seed}"
-    note, digest = place / "tested.json", hashlib.sha256(weights.file.read_bytes()).hexdigest()
-    if not note.is_file() or json.loads(note.read_text())["sha256"] != digest:
+    note, of = place / "tested.json", fingerprint(weights.file)
+    if not note.is_file() or json.loads(note.read_text()).get("of") != of:
         say(f"{weights.name}: data of seed {seed} …")
         make_data(card, seed, place)
         say(f"{weights.name}: test …")
         module = load_module(weights.file)
         metrics = tested(module, data_of(card, place / "data", module.num_points), place)
         with atomic_write(note) as file:
-            file.write(json.dumps({"sha256": digest, "metrics": metrics}).encode())
+            file.write(json.dumps({"of": of, "metrics": metrics}).encode())
     return compare(weights.name, card.metrics, json.loads(note.read_text())["metrics"])
 
 

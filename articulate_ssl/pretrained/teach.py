@@ -2,12 +2,12 @@
 
 A training is an hour, and what it leaves stays good while what decides and measures afterwards (`training.module`'s
 `LESSONS`) gets better. So lessons are taught again, by the weights' own training clouds and without labels, or by
-those of more objects; the test objects of the card are tested anew. What is finished stays if it is killed.
+those of more objects; the test objects of the card are tested anew. What is finished stays if it is killed, unless the
+code changes.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shlex
 import sys
@@ -20,6 +20,7 @@ from typing import Any
 from articulate_ssl.inference.checkpoint_file import CheckpointError
 from articulate_ssl.ops.progress import shown
 from articulate_ssl.pretrained.check import data_of, tested
+from articulate_ssl.pretrained.fingerprint import fingerprint
 from articulate_ssl.pretrained.pack import weaknesses
 from articulate_ssl.pretrained.rebuild import commit_of
 from articulate_ssl.pretrained.stages import Stage, Workplace
@@ -69,8 +70,8 @@ class Teaching:
         """
         card = self._of_its_data(WeightsCard.load(self.weights.file.with_suffix(CARD_SUFFIX)))
         root = self._make_data(card, say)
-        digest = hashlib.sha256(self.weights.file.read_bytes() + card.data["command"].encode()).hexdigest()
-        done = self._done(digest)
+        of = fingerprint(self.weights.file, card.data["command"])
+        done = self._done(of)
         module = load_module(self._taught if done else self.weights.file)
         data = data_of(card, root, module.num_points)
         for lesson in (lesson for lesson in LESSONS if lesson in self.lessons and lesson not in done):
@@ -80,7 +81,7 @@ class Teaching:
             write_weights(module, self._taught)
             done.append(lesson)
             with atomic_write(self._note) as file:
-                file.write(json.dumps({"of": digest, "done": done}).encode())
+                file.write(json.dumps({"of": of, "done": done}).encode())
         say(f"{self.weights.name}: test …")
         module = load_module(self._taught)  # as others will read them
         new = self._card(card, tested(module, data, self._place))
@@ -113,10 +114,10 @@ class Teaching:
             work.run(stage, say)
         return root
 
-    def _done(self, digest: str) -> list[str]:
-        """Lessons that the weights that lie here have had."""
+    def _done(self, of: str) -> list[str]:
+        """Lessons that the weights that lie here have had, by this code."""
         note = json.loads(self._note.read_text()) if self._note.is_file() else {}
-        return note["done"] if note.get("of") == digest else []
+        return note["done"] if note.get("of") == of else []
 
     def _card(self, card: WeightsCard, metrics: dict[str, Any]) -> WeightsCard:
         taught = f"{', '.join(lesson for lesson in LESSONS if lesson in self.lessons)} by {commit_of(Path.cwd())}"
