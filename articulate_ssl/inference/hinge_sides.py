@@ -7,7 +7,7 @@ about the door's normal, by a quarter or half a turn, if the body looks as those
 A network says how right the body looks (`surface_decision`). It learns that from predictions, most of which are right,
 and without labels; the few that are wrong it would learn as well, if it could tell by anything where the hinge is. So
 it sees nothing of that: frames are each cloud's own axes at right angles (`manhattan_frame`), which differ by exact
-quarter turns, and of the points only those of the body that lie behind the door's plane.
+quarter turns, and of the points only those that lie behind the closed door's plane.
 
 Some bodies say nothing, but doors do: of a safe the lock is above the handle. Where a door is hinged on the other side,
 objects are explained upside down; and who sees every object in the mirror as often as it is does not know at which side
@@ -37,7 +37,6 @@ from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.inference.surface_decision import LOOKS, SIZE, WithSurface
 from articulate_ssl.inference.upright_camera import UprightCamera
 from articulate_ssl.network.surface_network import SurfaceCloud, SurfaceSize
-from articulate_ssl.ops.chamfer import nearest_distance
 from articulate_ssl.ops.spin_images import SPIN_CHANNELS, spin_images
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.object_axes import object_axes
@@ -45,8 +44,7 @@ from articulate_ssl.shape.object_axes import object_axes
 TURNS = 4  # quarter turns: sides that a door may be hinged at
 # What reads bodies; more points were not tried to the end (docs/experiments.md, step 133).
 BODY_SIZE = SurfaceSize(read=256, centers=128)
-# Behind the closed door's plane, in normalised units. Nearer, door and body are not told apart well enough to hide
-# where the hinge is: with .04 fewer are found (docs/experiments.md, step 124).
+# Behind the closed door's plane, in normalised units. With .04 fewer are found (docs/experiments.md, step 124).
 _BEHIND = 0.12
 _CLOSED_REACH = math.radians(120)  # from the middle of the joint's range: the closed door is not farther. Chosen.
 
@@ -227,12 +225,13 @@ class HingeSides(WithSurface):
         dense: Tensor,  # [B, P, 3]
         normal: Tensor,  # [B, 3] of the doors, pointing at the bodies
     ) -> Tensor:  # [B, P] bool
-        """Which points are of the body and behind the closed door."""
+        """Which points are behind the closed door, where no open one is.
+
+        Which part they are said to be of must not matter: about the hinge, pieces of the body are taken for the door,
+        and where they are missed says where the hinge is.
+        """
         door = transform_points(prediction.base_pose, self.door.to(dense).expand(len(dense), 1, 3))
-        behind = ((dense - door) @ normal[..., None]).squeeze(-1) > _BEHIND
-        posed = [transform_points(prediction.part_pose[:, k], prediction.part_shape[:, k]) for k in range(2)]
-        to_part = torch.stack([nearest_distance(dense, part) for part in posed], dim=-1)
-        return behind & (to_part.argmin(dim=-1) == int(prediction.joint_parent[0, 0]))
+        return ((dense - door) @ normal[..., None]).squeeze(-1) > _BEHIND
 
 
 def turned_about(
