@@ -269,6 +269,9 @@ def test_nothing_seen_of_a_body_says_where_its_door_is():
         quarter = bodies.frames[0, :-1].mT @ bodies.frames[0, 1:]
         expected = roma.rotvec_to_rotmat(torch.tensor([0.0, 0.0, QUARTER])).expand(TURNS - 1, 3, 3)
         torch.testing.assert_close(quarter, expected, atol=1e-5, rtol=0)
+        # Nor by which of its points are taken for the door's.
+        mixed = Prediction(**{**tilted.__dict__, "part_shape": tilted.part_shape.flip(1)})
+        assert torch.equal(sides.bodies(mixed, dense, (dense,)).points[0], bodies.points[0])
         seen.append(bodies.frames)
     torch.testing.assert_close(bodies.points[1], bodies.points[0] + 0.001, atol=1e-6, rtol=0)
 
