@@ -25,7 +25,7 @@ from articulate_ssl.training.hinge_lessons import learn_hinge_sides
 TINY = SurfaceSize(read=48, centers=32, dims=(8, 8), radii=(0.3, 0.5), num_neighbors=8, global_dim=16, head_dim=16)
 QUARTER = math.pi / 2
 ZERO = -1.9  # joint state at which the door is closed
-HINGE, PIVOT = torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, -0.3, -0.26])
+HINGE, PIVOT = torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 0.3, -0.26])  # opens outwards
 BODY, DOOR = torch.tensor([0.6, 0.6, 0.5]), torch.tensor([0.6, 0.6, 0.02])
 
 
@@ -66,7 +66,7 @@ def _sides() -> HingeSides:
 def test_faces_say_when_the_door_is_closed():
     """To a fraction of a degree, though the joint is believed to be tilted; boxes about points then are off."""
     shape = _shape()
-    tilt = roma.rotvec_to_rotmat(torch.tensor([0.0, 0.1, 0.1]))
+    tilt = roma.rotvec_to_rotmat(torch.tensor([0.0, 0.1, -0.1]))
     believed = replace(shape, joints=replace(shape.joints, axis=HINGE[None] @ tilt.mT))
     frames = PartFrames(2)
     frames.flat.fill_(True)
