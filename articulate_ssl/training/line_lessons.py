@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from articulate_ssl.inference.touching_lines import shifts_to_touch
 from articulate_ssl.network.hypotheses import Hypotheses, concatenated
 from articulate_ssl.ops.progress import announced, tell
-from articulate_ssl.shape.touching_lines import shifts_to_touch
 from articulate_ssl.training.explanations import registered_points
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ import pytest
 import torch
 from articulated_objects import GLASSES, LAPTOP, OVEN, clouds, true_hypotheses
 
-from articulate_ssl.shape.touching_lines import shifts_to_touch
+from articulate_ssl.inference.touching_lines import shifts_to_touch
 
 NEAR = 0.055  # parts are .02 to .05 thick, and where they are hardly farther lines stay
 
