@@ -19,7 +19,7 @@ from articulate_ssl.inference.candidates import Candidates
 from articulate_ssl.inference.common_shape import CommonShape
 from articulate_ssl.inference.hypothesis_registration import HypothesisRegistration
 from articulate_ssl.inference.part_frames import PartFrames
-from articulate_ssl.inference.proportions import fit_proportions
+from articulate_ssl.inference.proportions import Descent, fit_proportions
 from articulate_ssl.inference.view_search import ViewSearch
 from articulate_ssl.network.articulated_network import ArticulatedNetwork
 from articulate_ssl.network.hypotheses import Hypotheses
@@ -69,23 +69,23 @@ class FinalFit:
         """Explanations in the proportions of clouds (`fit_proportions`), turned as faces say, where parts turn."""
         if not self.fits:
             return one
-        cycles, category = self.cycles, self.articulated.category.articulated_shape(self.articulated.joint_type)
+        category = self.articulated.category.articulated_shape(self.articulated.joint_type)
         observation, frames = self.registration.observation, self.part_frames
         # Complete clouds, and scans that teach views, show where a hinge is.
         both = observation.bidirectional
-        touching = both and observation.orientation.limited
+        descent = Descent(self.cycles, both, touching=both and observation.orientation.limited)
         if dense is None or not frames.learnt:
-            return fit_proportions(one, category, points, cycles, both, touching)
+            return fit_proportions(one, category, points, descent)
         one, known = frames.settled(one, dense)
+        descent = descent._replace(faces=frames.axes, known=known)
         if not self.common_shape.learnt:
-            return fit_proportions(one, category, points, cycles, both, touching, frames.axes, known)
+            return fit_proportions(one, category, points, descent)
         # Registered with another shape, a part may be so far off that faces of others are taken for its own.
         category = self.common_shape.shape(category.joints)
         one = replace(one, structure=replace(one.structure, pivot=self.common_shape.pivots(len(points))))
-        first = fit_proportions(one, category, points, cycles, both, touching, frames.axes, known)
-        settled, known = frames.settled(first, dense)
+        settled, known = frames.settled(fit_proportions(one, category, points, descent), dense)
         one = one.at(settled.base, settled.state)
-        return fit_proportions(one, category, points, cycles, both, touching, frames.axes, known)
+        return fit_proportions(one, category, points, descent._replace(known=known))
 
     def within_limits(
         self,

@@ -11,6 +11,7 @@ drawn to it.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,15 +23,30 @@ from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 
 
+class Descent(NamedTuple):
+    """How a shape descends to clouds.
+
+    Attributes:
+        cycles: Of descent.
+        bidirectional: Distances count both ways.
+        touching: Both parts of a joint are drawn to its line (`InstanceFit.optimise`).
+        faces: [K, 3, 3] columns, axes along which parts stretch instead of their principal ones, which of a body about
+            as wide as high are any; then it would shear.
+        known: [B] and [B, J] bool: which clouds stay turned as they are, and which joint states stay.
+    """
+
+    cycles: int
+    bidirectional: bool = True
+    touching: bool = False
+    faces: Tensor | None = None
+    known: tuple[Tensor, Tensor] | None = None
+
+
 def fit_proportions(
     one: Hypotheses,  # H = 1
     category: ArticulatedShape,
     points: Tensor,  # [B, N, 3]
-    cycles: int,
-    bidirectional: bool = True,
-    touching: bool = False,
-    faces: Tensor | None = None,  # [K, 3, 3] columns
-    known: tuple[Tensor, Tensor] | None = None,  # [B], [B, J] bool
+    descent: Descent,
 ) -> Hypotheses:  # H = 1
     """The category's shape in the proportions of clouds, from where explanations of them are.
 
@@ -39,12 +55,8 @@ def fit_proportions(
 
     Args:
         category: Every part has as many points.
-        touching: Both parts of a joint are drawn to its line (`InstanceFit.optimise`).
-        faces: Axes along which parts stretch instead of their principal ones, which of a body about as wide as high
-            are any; then it would shear.
-        known: Which clouds stay turned as they are, and which joint states stay.
     """
-    fit, base = descended(one, category, points, cycles, bidirectional, touching, faces, known)
+    fit, base = descended(one, category, points, descent)
     instances = fit.instances()
     parts = torch.stack([instances.part(part) for part in range(instances.num_parts)], dim=1)
     center = parts.mean(dim=2)
@@ -57,13 +69,10 @@ def descended(
     one: Hypotheses,  # H = 1
     category: ArticulatedShape,
     points: Tensor,  # [B, N, 3]
-    cycles: int,
-    bidirectional: bool = True,
-    touching: bool = False,
-    faces: Tensor | None = None,  # [K, 3, 3] columns
-    known: tuple[Tensor, Tensor] | None = None,  # [B], [B, J] bool
+    descent: Descent,
 ) -> tuple[InstanceFit, Tensor]:  # , [B, 4, 4]
     """See `fit_proportions`: the fit to clouds in the frames of explanations, and their poses before it."""
+    cycles, both, touching, faces, known = descent
     # A test runs in inference mode, whose tensors no gradient goes through.
     with torch.inference_mode(False):
         lines = replace(category.joints, axis=one.axis[:, 0].clone(), pivot=one.pivot.clone())
@@ -74,5 +83,5 @@ def descended(
         faces = None if faces is None else faces.clone()
         fit = InstanceFit(shape, still, one.state[:, 0].clone(), torch.Generator().manual_seed(0), faces=faces)
         known = None if known is None else tuple(value.clone() for value in known)
-        fit.optimise(seen, cycles, shared=False, bidirectional=bidirectional, touching=touching, known=known)
+        fit.optimise(seen, cycles, shared=False, bidirectional=both, touching=touching, known=known)
         return fit, base

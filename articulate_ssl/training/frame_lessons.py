@@ -16,7 +16,7 @@ from trimesh.bounds import oriented_bounds
 
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.inference.part_frames import WINDOWS, Faces, faces_of
-from articulate_ssl.inference.proportions import descended
+from articulate_ssl.inference.proportions import Descent, descended
 from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.ops.progress import tell
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
@@ -76,16 +76,8 @@ def _learn_common_shape(module: ArticulatedPoseModule, explained: Hypotheses, cl
     estimator, network = module.estimator, module.articulated
     frames, category = estimator.part_frames, network.category.articulated_shape(network.joint_type)
     one, known = frames.settled(explained, clouds)
-    fit, base = descended(
-        one,
-        category,
-        clouds[:, : registered_points(module)],
-        estimator.inference.proportions,
-        True,
-        False,
-        frames.axes,
-        known,
-    )
+    points, cycles = clouds[:, : registered_points(module)], estimator.inference.proportions
+    fit, base = descended(one, category, points, Descent(cycles, faces=frames.axes, known=known))
     seen = transform_points(invert_se3(base), clouds)
     best = fit.error(seen).argsort()[: int(_BEST * len(clouds))]
     maps = fit.maps()

@@ -14,7 +14,7 @@ from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
 from articulate_ssl.inference import part_frames
 from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.inference.part_frames import WINDOWS, Faces, PartFrames, faces_of, square_to
-from articulate_ssl.inference.proportions import fit_proportions
+from articulate_ssl.inference.proportions import Descent, fit_proportions
 from articulate_ssl.network.heads.shape import CanonicalShape
 from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.training import frame_lessons
@@ -223,10 +223,10 @@ def test_proportions_keep_what_faces_said(oven):
     shape = true_shape(OVEN, data)
     order = shape.label.argsort(stable=True)
     shape = replace(shape, points=shape.points[order], label=shape.label[order])
-    fitted = fit_proportions(one, shape, data.points[:, :600], 10, faces=frames.axes, known=known)
+    fitted = fit_proportions(one, shape, data.points[:, :600], Descent(10, faces=frames.axes, known=known))
     torch.testing.assert_close(fitted.base[..., :3, :3], one.base[..., :3, :3], atol=1e-5, rtol=0)
     torch.testing.assert_close(fitted.state, one.state)
-    free = fit_proportions(one, shape, data.points[:, :600], 10, faces=frames.axes)
+    free = fit_proportions(one, shape, data.points[:, :600], Descent(10, faces=frames.axes))
     assert not torch.allclose(free.state, one.state)
     back = transform_points(invert_se3(fitted.base[:, 0]), data.points)
     width = [points.amax(dim=1) - points.amin(dim=1) for points in (back, fitted.object_shape()[:, 0])]

@@ -13,7 +13,7 @@ from articulate_ssl.geometry.orientation_range import OrientationRange
 from articulate_ssl.geometry.se3 import se3, transform_points
 from articulate_ssl.inference import final_fit
 from articulate_ssl.inference.options import InferenceOptions
-from articulate_ssl.inference.proportions import fit_proportions
+from articulate_ssl.inference.proportions import Descent, fit_proportions
 from articulate_ssl.network.heads.shape import CanonicalShape
 from articulate_ssl.network.heads.structure import Structure
 from articulate_ssl.network.hypotheses import Hypotheses
@@ -61,7 +61,7 @@ def fitted(request):
     data = clouds(request.param, count=10, points=600, resample=True, proportions=0.25)
     shape = _category(request.param, data)
     before = _registered(shape, data)
-    return data, before, fit_proportions(before, shape, data.points, CYCLES)
+    return data, before, fit_proportions(before, shape, data.points, Descent(CYCLES))
 
 
 def test_states_orientations_and_hinges_come_nearer_to_the_truth(fitted):
@@ -87,17 +87,19 @@ def test_a_cloud_that_is_turned_is_explained_alike_and_so_is_one_alone():
     data = clouds(OVEN, count=4, points=400, resample=True, proportions=0.2)
     shape = _category(OVEN, data)
     start = _registered(shape, data)
-    every = fit_proportions(start, shape, data.points, CYCLES)
-    alone = fit_proportions(start.rows(torch.tensor([2])), shape, data.points[2:3], CYCLES)
+    every = fit_proportions(start, shape, data.points, Descent(CYCLES))
+    alone = fit_proportions(start.rows(torch.tensor([2])), shape, data.points[2:3], Descent(CYCLES))
     torch.testing.assert_close(alone.state[0], every.state[2], atol=5e-3, rtol=0)
     torch.testing.assert_close(alone.base[0], every.base[2], atol=5e-3, rtol=0)
     turn = roma.rotvec_to_rotmat(torch.randn(4, 3, generator=torch.Generator().manual_seed(3)))
     pose = se3(turn, torch.zeros(4, 3))
     # What is rounded otherwise, steps of descent amplify, by processors in different ways: from few of them.
     few = 4
-    every = fit_proportions(start, shape, data.points, few)
+    every = fit_proportions(start, shape, data.points, Descent(few))
     assert (every.base - start.base).abs().amax() > 5e-3
-    turned = fit_proportions(start.at(pose[:, None] @ start.base, start.state), shape, data.points @ turn.mT, few)
+    turned = fit_proportions(
+        start.at(pose[:, None] @ start.base, start.state), shape, data.points @ turn.mT, Descent(few)
+    )
     torch.testing.assert_close(turned.state, every.state, atol=2e-3, rtol=0)
     torch.testing.assert_close(turned.base, pose[:, None] @ every.base, atol=2e-3, rtol=0)
 
@@ -107,7 +109,7 @@ def test_it_runs_in_inference_mode():
     shape = _category(LAPTOP, data)
     with torch.inference_mode():
         data = Clouds(*(x.clone() for x in data))
-        after = fit_proportions(_registered(shape, data), shape, data.points, 1)
+        after = fit_proportions(_registered(shape, data), shape, data.points, Descent(1))
     assert after.base.isfinite().all() and not after.base.requires_grad
 
 
@@ -130,7 +132,7 @@ def test_what_a_view_hides_pulls_at_nothing():
     own = torch.einsum("bij,bni->bnj", data.base[:, :3, :3], data.points - data.base[:, None, :3, 3])
     front = own[..., 0].argsort(dim=1, descending=True)[:, :450]
     seen = data.points.gather(1, front[..., None].expand(-1, -1, 3))
-    one, both = (fit_proportions(start, shape, seen, CYCLES, way) for way in (False, True))
+    one, both = (fit_proportions(start, shape, seen, Descent(CYCLES, way)) for way in (False, True))
     back = [some.object_shape()[:, 0, :, 0].amin(dim=1) for some in (one, both)]
     assert (back[1] > back[0]).all()  # where they pull, every body becomes shallower
 
@@ -162,12 +164,12 @@ def test_parts_are_drawn_to_a_hinge_that_floats(monkeypatch):
         along = torch.linalg.cross(offset, one.axis[:, 0, 0, None, None].expand_as(offset)).norm(dim=-1)
         return along.sort(dim=-1).values[..., :8].mean(dim=-1).amax(dim=-1)
 
-    left, drawn = (fit_proportions(before, shape, data.points, CYCLES, touching=way) for way in (False, True))
+    left, drawn = (fit_proportions(before, shape, data.points, Descent(CYCLES, touching=way)) for way in (False, True))
     assert apart(left).max() > 0.08
     assert apart(drawn).max() < 0.055
     # Parts of complete clouds are not.
     seen = []
-    monkeypatch.setattr(final_fit, "fit_proportions", lambda *args: seen.append(args[4:6]) or args[0])
+    monkeypatch.setattr(final_fit, "fit_proportions", lambda *args: seen.append(args[3][1:3]) or args[0])
     for views, unidirectional in ((60.0, False), (180.0, False), (60.0, True)):
         module = tiny_module(orientation_range=views).eval()
         _observe(module, Observation(OrientationRange(views), unidirectional))
