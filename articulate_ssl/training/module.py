@@ -260,8 +260,10 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
                 network.mixed_precision = mixed
 
     def on_train_start(self) -> None:
-        """Remember how many points a cloud has."""
+        """Remember how many points a cloud has; stage 0 starts from one of them."""
         self.num_points = self.trainer.datamodule.hparams.num_points
+        if self.rigid is not None and self.global_step == 0:
+            self.rigid.start_from(SetClouds(self.trainer.datamodule).clouds(1)[0].to(self.device))
 
     def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """One step of stage 0, or of the recipe; under autocast only the backbones run in low precision."""

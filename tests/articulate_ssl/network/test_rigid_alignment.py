@@ -1,11 +1,25 @@
 """Stage 0: rotation permutes the rigid hypotheses and turns their poses."""
 
+from dataclasses import replace
+
 import pytest
+import roma
 import torch
 
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.network.options import NetworkOptions
 from articulate_ssl.network.rigid_alignment import RigidAlignment
+from articulate_ssl.ops.chamfer import hypothesis_distances
+
+TINY = NetworkOptions(
+    group_order=12,
+    dims=[4, 8],
+    radii=[0.3, 0.5],
+    num_neighbors=10,
+    num_kernel_points=13,
+    num_centers=[24, 16],
+    head_dim=6,
+)
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-4), (torch.float64, 1e-9)])
@@ -13,16 +27,7 @@ from articulate_ssl.network.rigid_alignment import RigidAlignment
 def test_hypotheses_are_equivariant(order, directions, dtype, tolerance):
     torch.manual_seed(0)
     group = rotation_group(order)
-    sizes = NetworkOptions(
-        group_order=order,
-        dims=[4, 8],
-        radii=[0.3, 0.5],
-        num_neighbors=10,
-        num_kernel_points=13,
-        num_centers=[24, 16],
-        head_dim=6,
-        directions=directions,
-    )
+    sizes = replace(TINY, group_order=order, directions=directions)
     network = RigidAlignment(sizes, 10)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.4)
@@ -36,3 +41,20 @@ def test_hypotheses_are_equivariant(order, directions, dtype, tolerance):
             after = network(points @ rotation.T + shift).posed()[:, group.product[a]]
             expected = before @ rotation.T + shift
             assert (after - expected).norm() / expected.norm() < tolerance
+
+
+def test_a_cloud_that_the_shape_started_from_is_found_wherever_it_is_turned_to():
+    """By the group's rotations alone: nothing was trained."""
+    torch.manual_seed(0)
+    network = RigidAlignment(TINY, 48)
+    cloud = torch.rand(64, 3) * torch.tensor([1.0, 0.6, 0.2])
+    network.start_from(cloud)
+    torch.testing.assert_close(network.template, cloud[:48] - cloud.mean(dim=0))
+    for element in network.elements[[0, 5, 11]].float():
+        turned = (cloud @ element.T)[None]
+        with torch.no_grad():
+            hypotheses = network(turned)
+        best = hypothesis_distances(turned, hypotheses.posed()).argmin(dim=1)
+        assert roma.rotmat_geodesic_distance(hypotheses.rotation[0, best[0]], element) < 0.1
+    network.start_from(cloud[:30])  # of fewer points than the shape has
+    torch.testing.assert_close(network.template[30:], network.template[:18])

@@ -15,6 +15,7 @@ from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.losses.objective import ObjectiveOptions, paper_terms
 from articulate_ssl.training.checkpoint import load_module
 from articulate_ssl.training.recipes.recipe import Outcome
+from articulate_ssl.training.set_clouds import SetClouds
 from datamodules.articulated_dataset import LABEL_ARRAYS, split_labels
 from datamodules.shards import read_shard, write_shard
 
@@ -217,6 +218,15 @@ def test_resuming_gives_the_weights_of_never_stopping(tmp_path, root, options, s
     fit(second, root, steps, tmp_path / "half.ckpt")
     for name, value in whole.state_dict().items():
         torch.testing.assert_close(second.state_dict()[name], value, rtol=0, atol=0, msg=name)
+
+
+def test_stage_0_starts_from_a_training_cloud(root):
+    """Whose points are where those of the shape are, but for one small step."""
+    module = tiny_module(1, rigid_steps=1)
+    trainer = fit(module, root, 1)
+    cloud = SetClouds(trainer.datamodule).clouds(1)[0]
+    start = (cloud - cloud.mean(dim=0))[: len(module.rigid.template)]
+    assert (module.rigid.template - start).abs().max() < 0.01
 
 
 # One head per part, of which the root reads the base head and every other part the state head; and a softmax ignores a
