@@ -69,15 +69,19 @@ def _compare(category: str, names: tuple[str, ...], args: argparse.Namespace) ->
     defined = [name for name in names if any(args.view in row.views for row in rows_of(name))]
     jobs = [Job(setting, name, seed) for seed in range(args.seeds) for name in defined]
     failed: dict[Job, str] = {}
+
+    def keep(*some: Job) -> None:
+        for file in measured.keep(some):
+            _say(f"{file}: kept")
+
+    keep(*jobs)
     if missing := [job for job in jobs if not (job.finished or measured.knows(job))]:
         try:
             make_data(setting, tuple(job.learner for job in missing), _say)
         except StageFailed as error:
             _say(str(error))
             return False
-        failed = do_jobs(missing, args.workers, args.scheduler)
-    for file in measured.keep(jobs):
-        _say(f"{file}: kept")
+        failed = do_jobs(missing, args.workers, args.scheduler, keep)
     results = collect(setting, names, range(args.seeds), list(failed.values()), measured)
     args.build.mkdir(parents=True, exist_ok=True)  # where all results were kept, no job made it
     out = args.build / setting.name

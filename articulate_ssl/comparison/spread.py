@@ -21,7 +21,12 @@ _TAIL = 4096  # bytes of a log in which its last line begins
 _WIDTH = 90  # characters of that line
 
 
-def do_jobs(jobs: Sequence[Job], workers: int, scheduler: str | None = None) -> dict[Job, str]:
+def do_jobs(
+    jobs: Sequence[Job],
+    workers: int,
+    scheduler: str | None = None,
+    done: Callable[[Job], None] = lambda job: None,
+) -> dict[Job, str]:
     """Do all; one that fails does not stop the others.
 
     A job is a program of its own, so threads of this process, which wait for them, are workers enough.
@@ -31,6 +36,7 @@ def do_jobs(jobs: Sequence[Job], workers: int, scheduler: str | None = None) -> 
         workers: So many at once on this machine.
         scheduler: Address of a Dask scheduler (`tcp://…`) to use instead; its workers must see the same folders and
             have this package.
+        done: Called for each that did not fail, as soon as it is finished.
 
     Returns:
         Why some failed.
@@ -40,13 +46,13 @@ def do_jobs(jobs: Sequence[Job], workers: int, scheduler: str | None = None) -> 
     """
     with _shown() as lines:
         if scheduler is not None:
-            return _on_cluster(jobs, scheduler, lines)
+            return _on_cluster(jobs, scheduler, lines, done)
         failed = {}
         with ThreadPoolExecutor(workers) as pool:
             futures = {pool.submit(_watched, job, lines): job for job in jobs}
             try:
                 for future in as_completed(futures):
-                    _collect(future, futures[future], failed, lines)
+                    _collect(future, futures[future], failed, lines, done)
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
@@ -109,15 +115,17 @@ def _watched(job: Job, lines: _Lines) -> None:
             del lines.at_work[job]
 
 
-def _collect(future: Future, job: Job, failed: dict[Job, str], lines: _Lines) -> None:
+def _collect(future: Future, job: Job, failed: dict[Job, str], lines: _Lines, done: Callable[[Job], None]) -> None:
     try:
         future.result()
     except (StageFailed, OSError) as error:
         failed[job] = str(error)
         lines.say(str(error))
+    else:
+        done(job)
 
 
-def _on_cluster(jobs: Sequence[Job], scheduler: str, lines: _Lines) -> dict[Job, str]:
+def _on_cluster(jobs: Sequence[Job], scheduler: str, lines: _Lines, done: Callable[[Job], None]) -> dict[Job, str]:
     try:
         from dask.distributed import Client
         from dask.distributed import as_completed as as_done
@@ -133,7 +141,7 @@ def _on_cluster(jobs: Sequence[Job], scheduler: str, lines: _Lines) -> dict[Job,
         futures = {client.submit(_make, job, pure=False): job for job in jobs}
         for future in as_done(futures):
             job = futures[future]
-            _collect(future, job, failed, lines)
+            _collect(future, job, failed, lines, done)
             if job not in failed:
                 lines.say(f"{job.title}: done")
     return failed

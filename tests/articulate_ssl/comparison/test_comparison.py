@@ -1,5 +1,6 @@
 """One table from many jobs: what is in it, what its intervals are, and that nothing is done twice."""
 
+import contextlib
 import csv
 import json
 import math
@@ -140,7 +141,12 @@ def test_finished_jobs_are_not_repeated_and_a_failure_stops_no_other(tmp_path, p
     setting = _setting(tmp_path)
     jobs = [Job(setting, name, seed) for seed in (0, 1) for name in ("oracle_icp", "op_align")]
     programs.fails = "op_align"
-    failed = do_jobs(jobs, workers)
+    done = []
+    failed = do_jobs(jobs, workers, done=done.append)
+    assert [(job.learner, job.seed) for job in sorted(done, key=lambda job: job.seed)] == [
+        ("oracle_icp", 0),
+        ("oracle_icp", 1),
+    ]
     assert {job.learner for job in failed} == {"op_align"} and all("method.log" in why for why in failed.values())
     assert [job.finished for job in jobs] == [True, False, True, False]
     programs.fails, count = "", len(programs.commands)
@@ -291,6 +297,24 @@ def test_the_papers_tables_are_whole():
         values = [category[method][quantity] for category in tables[view].values()]
         flat = [figure for value in values for figure in (value if isinstance(value, list) else [value])]
         assert sum(flat) / len(flat) == pytest.approx(average, rel=0.03), (view, method, quantity)
+
+
+def test_what_is_finished_is_kept_before_the_rest_is(tmp_path, programs, monkeypatch):
+    """As a machine may be lost before that."""
+    (tmp_path / "data" / "laptop" / "procedural-complete").mkdir(parents=True)
+    (tmp_path / "data" / "laptop" / "procedural-complete" / "manifest.json").touch()
+    make = Job.make
+
+    def cut_off(job, *args):
+        if job.learner == "op_align":
+            raise KeyboardInterrupt
+        make(job, *args)
+
+    monkeypatch.setattr(Job, "make", cut_off)
+    options = ["--root", str(tmp_path / "data"), "--build", str(tmp_path / "one"), "--measured", str(tmp_path / "kept")]
+    with contextlib.suppress(KeyboardInterrupt):
+        command.main(["--methods", "oracle_icp", "op_align", *options])
+    assert [file.name for file in (tmp_path / "kept" / "laptop-complete").iterdir()] == ["oracle_icp-0.json"]
 
 
 def test_results_keep_the_order_of_the_rows(tmp_path, programs):
