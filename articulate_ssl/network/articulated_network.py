@@ -59,7 +59,7 @@ class ArticulatedNetwork(nn.Module):
         self.axis_head = AxisHead(num_parts, options)
         self.shape_head = ShapeHead(num_parts, options)
         self.pair_head = PairHead(num_parts, options)
-        self.category = CategoryObject(num_parts, options.shape_points)
+        self.category = CategoryObject(num_parts, options.shape_points, options.shared_axis)
 
     def forward(
         self,
@@ -110,7 +110,7 @@ class ArticulatedNetwork(nn.Module):
             pair_pivot,
             pair_axis,
             pair_pivot[:, pair],
-            pair_axis[:, :, pair],
+            category.joint_axis().expand(clouds, count, -1, -1),
             chain,
             self.joint_type,
         )

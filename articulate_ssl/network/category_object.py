@@ -46,9 +46,10 @@ class CategoryObject(nn.Module):
         mean_confidence: [E] running mean of the predicted adjacency confidences, from which the chain is extracted.
     """
 
-    def __init__(self, num_parts: int, shape_points: int) -> None:
-        """Args: K and M."""
+    def __init__(self, num_parts: int, shape_points: int, shared_axis: bool = False) -> None:
+        """Args: K and M; whether all joints have the direction of the chain's first."""
         super().__init__()
+        self.shared_axis = shared_axis
         pairs = pair_index(num_parts)
         self.template = nn.Parameter(_START_SIZE * torch.randn(num_parts, shape_points, 3))
         self.assembly = nn.Parameter(torch.zeros(num_parts, 3))
@@ -73,6 +74,14 @@ class CategoryObject(nn.Module):
         """The category's kinematic chain, from the running mean of the predicted adjacency confidences."""
         return extract_chain(self.mean_confidence, self.num_parts)
 
+    def joint_axis(self) -> Tensor:
+        """[J, 3] unit directions of the chain's joints.
+
+        Where all joints have one, networks read that of the first, and nothing holds those of the others.
+        """
+        axis = functional.normalize(self.axis[pair_of_joints(self.chain(), self.pairs)], dim=-1)
+        return axis[:1].expand_as(axis) if self.shared_axis else axis
+
     @torch.no_grad()
     def articulated_shape(self, joint_type: int) -> ArticulatedShape:
         """The category's own shape with the joints of its chain; what `adopt` took over comes back, but thinned."""
@@ -80,7 +89,7 @@ class CategoryObject(nn.Module):
         label = torch.arange(self.num_parts, device=self.template.device).repeat_interleave(self.template.shape[1])
         pair = pair_of_joints(chain, self.pairs)
         return ArticulatedShape(
-            canonical.shape.flatten(0, 1), label, Joints(chain, canonical.axis[pair], canonical.pivot[pair], joint_type)
+            canonical.shape.flatten(0, 1), label, Joints(chain, self.joint_axis(), canonical.pivot[pair], joint_type)
         )
 
     @torch.no_grad()

@@ -90,3 +90,18 @@ def test_lines_that_move_leave_parts_where_they_are():
     moved = [transform_points(pose, one.joints.pivot[:, None])[:, 0] for pose, one in ((old, before), (new, after))]
     by = (old[:, :3, :3] @ shift[..., None]).squeeze(-1)
     torch.testing.assert_close(moved[1] - moved[0], by, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_the_categorys_joints_have_the_direction_that_networks_read(shared):
+    """One for all where they share it, whatever became of those that nothing reads."""
+    torch.manual_seed(0)
+    network = ArticulatedNetwork(_small(shared_axis=shared), num_parts=4)
+    for head in network.axis_head.perceptron:
+        torch.nn.init.zeros_(head[-1].weight)  # instances tilt no axis
+    read = network(torch.rand(1, 32, 3)).axis[0, 0]
+    shape = network.category.articulated_shape(REVOLUTE)
+    torch.testing.assert_close(shape.joints.axis, read.detach())
+    base, state = torch.eye(4).expand(1, 1, 4, 4), torch.zeros(1, 1, 3)
+    torch.testing.assert_close(network.category_at(base, state).axis[0, 0], read)
+    assert (read.std(dim=0).max() < 1e-6) == shared
