@@ -98,7 +98,7 @@ def test_like_parts_are_told_apart_within_a_range():
         return base, roma.rotmat_geodesic_distance(frame[:, None], frame).rad2deg().max()
 
     base, spread = found(80.0)
-    assert spread < 45
+    assert spread < 90  # 10 to 51 of four seeds of clouds; 180 if plates are exchanged
     assert OrientationRange(80.0).contains(base).all()
     assert _angle(mean_rotation(base)) < 15
     assert found(180.0)[1] > 90
