@@ -60,7 +60,7 @@ class RigidAlignment(nn.Module):
     ) -> None:
         """Let the canonical shape start as a cloud of the category.
 
-        From points about nothing poses take twice as many steps to learn (docs/experiments.md, step 164).
+        From random points poses took twice as many steps to learn (docs/experiments.md, step 164).
         """
         row = torch.arange(len(self.template), device=cloud.device) % len(cloud)
         self.template.copy_(cloud[row] - cloud.mean(dim=0))

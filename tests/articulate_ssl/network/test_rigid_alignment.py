@@ -5,21 +5,11 @@ from dataclasses import replace
 import pytest
 import roma
 import torch
+from tiny import NETWORK
 
 from articulate_ssl.geometry.rotation_group import rotation_group
-from articulate_ssl.network.options import NetworkOptions
 from articulate_ssl.network.rigid_alignment import RigidAlignment
 from articulate_ssl.ops.chamfer import hypothesis_distances
-
-TINY = NetworkOptions(
-    group_order=12,
-    dims=[4, 8],
-    radii=[0.3, 0.5],
-    num_neighbors=10,
-    num_kernel_points=13,
-    num_centers=[24, 16],
-    head_dim=6,
-)
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-4), (torch.float64, 1e-9)])
@@ -27,7 +17,7 @@ TINY = NetworkOptions(
 def test_hypotheses_are_equivariant(order, directions, dtype, tolerance):
     torch.manual_seed(0)
     group = rotation_group(order)
-    sizes = replace(TINY, group_order=order, directions=directions)
+    sizes = replace(NETWORK, group_order=order, directions=directions)
     network = RigidAlignment(sizes, 10)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.4)
@@ -46,7 +36,7 @@ def test_hypotheses_are_equivariant(order, directions, dtype, tolerance):
 def test_a_cloud_that_the_shape_started_from_is_found_wherever_it_is_turned_to():
     """By the group's rotations alone: nothing was trained."""
     torch.manual_seed(0)
-    network = RigidAlignment(TINY, 48)
+    network = RigidAlignment(NETWORK, 48)
     cloud = torch.rand(64, 3) * torch.tensor([1.0, 0.6, 0.2])
     network.start_from(cloud)
     torch.testing.assert_close(network.template, cloud[:48] - cloud.mean(dim=0))
