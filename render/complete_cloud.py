@@ -39,13 +39,17 @@ class ReachableSurface:
         """
         self.instance = instance
         scenes = [_Scene(instance, instance.part_motion(q)) for q in states]
+        own = _OwnPart(instance, [scene.motion for scene in scenes])
         drawn_points, drawn_part, reached = [], [], 0
         for _ in range(_MAX_DRAWS):
             points, part_id = sample_surface(instance, pool_size, rng)
-            visible = np.zeros(len(points), dtype=bool)
-            for scene in scenes:
-                hidden = np.flatnonzero(~visible)
-                visible[hidden] = scene.reaches(points[hidden], part_id[hidden])
+            visible = scenes[0].reaches(points, part_id)
+            hidden = np.flatnonzero(~visible)
+            ways = own.leaves_open(points[hidden], part_id[hidden])
+            for scene in scenes[1:]:
+                found = scene.reaches(points[hidden], part_id[hidden], ways)
+                visible[hidden[found]] = True
+                hidden, ways = hidden[~found], ways[:, ~found]
             drawn_points.append(points[visible])
             drawn_part.append(part_id[visible])
             reached += int(visible.sum())
@@ -100,27 +104,50 @@ def move_parts(
     return moved
 
 
+class _OwnPart:
+    """What hides a point in every articulation state: its own part, where that is never turned."""
+
+    def __init__(self, instance: ArticulatedObject, motions: list[np.ndarray]) -> None:
+        rotations = np.stack(motions)[:, :, :3, :3]
+        self.gap = _gap(instance)
+        self.casters = {
+            part: _ray_caster([mesh])
+            for part, mesh in enumerate(instance.meshes)
+            if (rotations[:, part] == np.eye(3)).all()
+        }
+
+    def leaves_open(self, points: np.ndarray, part_id: np.ndarray) -> np.ndarray:  # [NUM_DIRECTIONS, N] bool
+        """The directions in which a point's own part does not hide it, as far as one state tells that of all."""
+        ways = np.ones((NUM_DIRECTIONS, len(points)), dtype=bool)
+        for part, caster in self.casters.items():
+            mine = np.flatnonzero(part_id == part)
+            for way, direction in zip(ways, _directions(), strict=True):
+                way[mine] = _free(caster, points[mine].astype(np.float32), direction, self.gap)
+        return ways
+
+
 class _Scene:
     """The posed instance, ready for occlusion tests from distant sensors."""
 
     def __init__(self, instance: ArticulatedObject, motion: np.ndarray) -> None:
         self.motion = motion
-        self.gap = 1e-4 * instance.rest_diagonal
-        self.caster = o3d.t.geometry.RaycastingScene(nthreads=1)
-        for mesh, matrix in zip(instance.meshes, motion, strict=True):
-            vertices = trimesh.transform_points(mesh.vertices, matrix)
-            self.caster.add_triangles(vertices.astype(np.float32), mesh.faces.astype(np.uint32))
+        self.gap = _gap(instance)
+        self.caster = _ray_caster(
+            [mesh.copy().apply_transform(matrix) for mesh, matrix in zip(instance.meshes, motion, strict=True)]
+        )
 
-    def reaches(self, points: np.ndarray, part_id: np.ndarray) -> np.ndarray:  # [N] bool
+    def reaches(
+        self,
+        points: np.ndarray,  # [N, 3]
+        part_id: np.ndarray,  # [N]
+        ways: np.ndarray | None = None,  # [NUM_DIRECTIONS, N] bool: the directions to look in; all by default
+    ) -> np.ndarray:  # [N] bool
         """Whether the line from a point to infinity is free in one of many directions."""
         posed = move_parts(points, part_id, self.motion).astype(np.float32)
         free = np.zeros(len(points), dtype=bool)
-        for direction in fibonacci_sphere(NUM_DIRECTIONS).astype(np.float32):
-            hidden = np.flatnonzero(~free)
-            rays = np.empty((len(hidden), 6), dtype=np.float32)
-            rays[:, :3] = posed[hidden] + self.gap * direction
-            rays[:, 3:] = direction
-            free[hidden] = ~self.caster.test_occlusions(rays, nthreads=1).numpy()
+        for k, direction in enumerate(_directions()):
+            asked = np.flatnonzero(~free if ways is None else ~free & ways[k])
+            free[asked] = _free(self.caster, posed[asked], direction, self.gap)
         return free
 
 
@@ -131,3 +158,32 @@ def fibonacci_sphere(count: int) -> np.ndarray:  # [count, 3]
     radius, angle = np.sqrt(1 - y * y), np.pi * (3 - np.sqrt(5)) * k
     directions = np.stack([radius * np.cos(angle), y, radius * np.sin(angle)], axis=1)
     return directions[np.argsort(np.minimum(k, count - 1 - k) * 2 + (k >= count / 2))]
+
+
+def _directions() -> np.ndarray:  # [NUM_DIRECTIONS, 3] float32
+    return fibonacci_sphere(NUM_DIRECTIONS).astype(np.float32)
+
+
+def _gap(instance: ArticulatedObject) -> float:
+    """How far from its point a ray begins, so that the point's own triangle does not stop it."""
+    return 1e-4 * instance.rest_diagonal
+
+
+def _ray_caster(meshes: list[trimesh.Trimesh]) -> o3d.t.geometry.RaycastingScene:
+    caster = o3d.t.geometry.RaycastingScene(nthreads=1)
+    for mesh in meshes:
+        caster.add_triangles(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32))
+    return caster
+
+
+def _free(
+    caster: o3d.t.geometry.RaycastingScene,
+    points: np.ndarray,  # [N, 3] float32
+    direction: np.ndarray,  # [3] float32
+    gap: float,
+) -> np.ndarray:  # [N] bool
+    """Whether nothing lies between the points and infinity."""
+    rays = np.empty((len(points), 6), dtype=np.float32)
+    rays[:, :3] = points + gap * direction
+    rays[:, 3:] = direction
+    return ~caster.test_occlusions(rays, nthreads=1).numpy()

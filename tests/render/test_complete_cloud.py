@@ -10,7 +10,11 @@ import trimesh
 from objects import box, box_laptop
 from scipy.spatial import cKDTree
 
-from render.complete_cloud import ReachableSurface, fibonacci_sphere, move_parts, sample_surface
+from render import complete_cloud
+from render.category import load_category
+from render.complete_cloud import ReachableSurface, _free, _OwnPart, fibonacci_sphere, move_parts, sample_surface
+from render.posing import sample_states
+from render.sources import open_source
 
 
 def surface_of(instance, states=((1.0,),), pool_size=4000) -> ReachableSurface:
@@ -49,6 +53,26 @@ def test_surfaces_that_only_show_when_opened_are_kept():
 
     assert deep_points([[0.0]]) == 0
     assert deep_points([[0.0], [1.2]]) > 100
+
+
+@pytest.mark.parametrize("category", ["drawer", "oven"])
+def test_what_its_own_part_hides_is_hidden_in_every_state(category, monkeypatch):
+    """Directions that a part blocks itself are left out, which must not change which points are reached."""
+    spec = load_category(category)
+    instance = spec.to_rest(open_source("procedural", spec, None, 0).load(f"{category}-0000"))
+    states = sample_states(spec.sampled_ranges(instance), 4, np.random.default_rng(0))
+    asked = []
+
+    def counted(caster, points, direction, gap):
+        asked.append(len(points))
+        return _free(caster, points, direction, gap)
+
+    monkeypatch.setattr(complete_cloud, "_free", counted)
+    fast, rays = surface_of(instance, states), sum(asked)
+    asked.clear()
+    monkeypatch.setattr(_OwnPart, "leaves_open", lambda self, points, part_id: np.ones((64, len(points)), dtype=bool))
+    np.testing.assert_array_equal(surface_of(instance, states).points, fast.points)
+    assert rays < 0.9 * sum(asked)
 
 
 def test_open_shells_are_seen_from_both_sides():
