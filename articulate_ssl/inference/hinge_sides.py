@@ -9,7 +9,7 @@ and without labels; the few that are wrong it would learn as well, if it could t
 it sees nothing of that: frames are each cloud's own axes at right angles (`manhattan_frame`), which differ by exact
 quarter turns, and of the points only those that lie behind the closed door's plane.
 
-Some bodies themselves tell where the hinge is, as the opening of a safe that leaves room for it at one side
+Some bodies themselves seem to tell where the hinge is, as the opening of a safe leaves room for it at one side
 (docs/experiments.md, step 170). But of a safe the lock is above the handle. Where a door is hinged on the other side,
 objects are explained upside down; and who sees every object in the mirror as often as it is does not know at which side
 its hinge is. So there, all of a cloud is seen, as it is and in the mirror, and half turns are told.
