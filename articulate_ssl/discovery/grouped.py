@@ -34,7 +34,7 @@ from articulate_ssl.discovery.one_object.find import MIN_CLOUDS, find_one_object
 from articulate_ssl.discovery.one_object.template import as_template
 from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.discovery.part_boxes import fit_part_boxes
-from articulate_ssl.discovery.references import choose_objects
+from articulate_ssl.discovery.references import choose_objects, evenly_chosen
 from articulate_ssl.discovery.registered_shape import RegisteredShape, trimmed_mean
 from articulate_ssl.discovery.similar_clouds import LabelledClouds
 from articulate_ssl.discovery.synchronization import unit_boxes
@@ -89,7 +89,7 @@ def discover_grouped(
             '(`make data ... ARGS="--states 10"`), put all scans of an object into one folder (SOURCE=clouds), allow '
             "more --model.discovery.clouds, or leave grouped out"
         )
-    of_object = [_some((instance == one).nonzero().squeeze(-1), most_clouds) for one in objects]
+    of_object = [evenly_chosen((instance == one).nonzero().squeeze(-1), most_clouds) for one in objects]
     collection = Collection.of(torch.cat([clouds, scans[torch.cat(of_object)]]), joint_type, options, Observation())
     templates, last = [], len(clouds)
     for number, rows in enumerate(_announced(of_object), start=1):
@@ -118,11 +118,6 @@ def discover_grouped(
         found = _placed(templates, clouds @ collection.frame[given].mT, options)
     _announce(len(objects) + 1, of_object, "done")
     return collection.as_given(found, given)
-
-
-def _some(rows: Tensor, most: int) -> Tensor:
-    """At most so many of them, spread evenly."""
-    return rows[torch.linspace(0, len(rows) - 1, min(len(rows), most)).round().long()]
 
 
 def _template(

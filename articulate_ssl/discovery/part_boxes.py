@@ -25,8 +25,8 @@ def fit_part_boxes(
     """The shape in every cloud, stretched; a part with too few points stays where the shape has it, as large."""
     generator = torch.Generator()  # of points that nothing draws
     axes = torch.eye(3).to(clouds).expand(shape.num_parts, 3, 3)
-    low, high, seen = _boxes(clouds, part, shape.num_parts)
-    own_low, own_high, _ = _boxes(shape.points[None], shape.label[None], shape.num_parts)
+    low, high, seen = part_boxes(clouds, part, shape.num_parts)
+    own_low, own_high, _ = part_boxes(shape.points[None], shape.label[None], shape.num_parts)
     own_center = (own_low + own_high)[0] / 2
     ratio = torch.where(seen[..., None], (high - low).clamp(min=1e-6) / (own_high - own_low).clamp(min=1e-6), 1.0)
     still = torch.eye(4).to(clouds).expand(len(clouds), 4, 4)
@@ -47,7 +47,7 @@ def fit_part_boxes(
     return InstanceFit(shape, base, shape.joints.clamped(along), generator, axes, log_stretch, all_beside)
 
 
-def _boxes(
+def part_boxes(
     clouds: Tensor,  # [n, N, 3]
     part: Tensor,  # [n, N]
     num_parts: int,

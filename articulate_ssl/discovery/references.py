@@ -42,6 +42,11 @@ def choose_objects(
     return objects[_medoids(means, min(count, len(objects)))]
 
 
+def evenly_chosen(rows: Tensor, most: int) -> Tensor:
+    """At most so many of them, spread evenly."""
+    return rows[torch.linspace(0, len(rows) - 1, min(len(rows), most)).round().long()]
+
+
 def _sorted_radii(clouds: Tensor) -> Tensor:
     return (clouds - clouds.mean(dim=1, keepdim=True)).norm(dim=-1).sort(dim=1).values
 

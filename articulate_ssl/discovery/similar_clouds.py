@@ -22,6 +22,7 @@ from articulate_ssl.ops.chamfer import nearest_distance, nearest_index
 # Points of each whose distances to a cloud say which clouds are compared with it at all, and how many are. By as many
 # points on both sides instead of the cloud's distance field, 2 points of mIoU were lost; so none is.
 _SCREENED, _SCREENS = 64, 512
+ASKING = 1024  # points of a cloud whose distance field is compared with
 _COMPARED = 256  # points of each by which clouds are compared
 _VOTING = 32  # at most, and at most every fourth: of 3,944 clouds 8 and 16 were worse, 64 as good
 
@@ -39,7 +40,7 @@ class LabelledClouds(NamedTuple):
 
     def votes(
         self,
-        boxes: Tensor,  # [n, N, 3] clouds that stand as these do, in unit boxes, farthest-point order
+        boxes: Tensor,  # [n, N, 3] clouds that stand as these do, in unit boxes, farthest-point order (`ASKING`)
         num_parts: int,
         points: Tensor | None = None,  # [n, M, 3] that are asked for, in the same boxes; those of the clouds by default
     ) -> Tensor:  # [n, M, K]

@@ -40,6 +40,7 @@ from articulate_ssl.training.hinge_lessons import learn_hinge_sides
 from articulate_ssl.training.hub import HubWeights
 from articulate_ssl.training.joint_limits import learn_joint_limits
 from articulate_ssl.training.label_free_report import LabelFreeReport
+from articulate_ssl.training.object_lessons import learn_objects
 from articulate_ssl.training.recipes import recipe_class
 from articulate_ssl.training.recipes.recipe import Outcome
 from articulate_ssl.training.running_statistics import RadiusStatistics
@@ -56,7 +57,7 @@ JOINT_TYPES = {"revolute": REVOLUTE, "prismatic": PRISMATIC}
 # What is learnt after the last step, in this order: each reads what those before it have learnt. Joint limits come
 # first, as what is explained beyond them must not teach, and again when it is known how faces lie: that moves states.
 LESSONS = (
-    *("first_limits", "two_ways", "turns", "handedness", "part_frames", "hinge_sides", "joint_limits"),
+    *("first_limits", "two_ways", "turns", "objects", "handedness", "part_frames", "hinge_sides", "joint_limits"),
     "confidence",
 )
 # Terms of the loss, by the names that they are logged under.
@@ -90,6 +91,9 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         two_ways_samples: Training clouds from which the decision between two explanations is learnt, of those that fit
             alike (`inference.two_ways`), of predictions and their rivals (`inference.surface_decision`), or of the
             turns that a collection says (`inference.sliding_search`); 0 learns none.
+        object_samples: Training clouds of whole objects, each from all its clouds, whose parts are found where some
+            objects' were, as those have them and as they move (`discovery.one_object.as_others`): where parts slide,
+            in the multi-state setting (`discovery.grouped`). Ten seconds an object; 0 finds none.
         handedness_samples: Training clouds of an upright camera from which it is learnt whether some objects are mirror
             images of the others (`inference.handedness`); 0 learns nothing of it.
         part_frames_samples: Training clouds from which it is learnt which parts have faces that say how they are
@@ -119,6 +123,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         inference: InferenceOptions = InferenceOptions(),  # noqa: B008
         calibration_samples: int = 128,
         two_ways_samples: int = 2000,
+        object_samples: int = 1200,
         handedness_samples: int = 256,
         part_frames_samples: int = 256,
         hinge_sides_samples: int = 2000,
@@ -138,7 +143,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             inference = replace(inference, part_neighbours=recipe_type.part_neighbours)
         self.category, self.num_parts, self.schedule = category, num_parts, schedule
         self.inference, self.calibration_samples = inference, calibration_samples
-        self.two_ways_samples, self.handedness_samples = two_ways_samples, handedness_samples
+        self.two_ways_samples, self.object_samples = two_ways_samples, object_samples
+        self.handedness_samples = handedness_samples
         self.part_frames_samples, self.hinge_sides_samples = part_frames_samples, hinge_sides_samples
 
         self.articulated = ArticulatedNetwork(network, num_parts, JOINT_TYPES[joint_type], state_bound=state_range)
@@ -220,6 +226,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             "first_limits": limits,
             "two_ways": (learn_two_ways, self.two_ways_samples if decides else 0),
             "turns": (learn_turns, self.two_ways_samples if refines and any_way and self.sliding.learnt else 0),
+            "objects": (learn_objects, self.object_samples if refines and len(self.sliding.labelled) else 0),
             "handedness": (learn_handedness, 0 if any_way else self.handedness_samples),
             "part_frames": (learn_part_frames, self.part_frames_samples if refines and turns else 0),
             "hinge_sides": (learn_hinge_sides, self.hinge_sides_samples if refines else 0),
@@ -229,7 +236,9 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         for lesson in LESSONS:
             learn, samples = plan[lesson]
             if lesson in lessons and samples:
-                learn(self, training_clouds.clouds(samples).to(self.device))
+                whole = lesson == "objects"
+                shown = training_clouds.objects(samples) if whole else (training_clouds.clouds(samples),)
+                learn(self, *(some.to(self.device) for some in shown))
         self.train(training)
 
     # Training

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from articulate_ssl.discovery.discover import DiscoveryError, discover
 from articulate_ssl.discovery.one_object.adjustment import Placed, adjusted
-from articulate_ssl.discovery.one_object.moving_labels import CAP, moving_costs, spread_labels
+from articulate_ssl.discovery.one_object.moving_labels import CAP, believed, moving_costs, spread_labels
 from articulate_ssl.discovery.one_object.surface import Surface
 from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.geometry.kinematic_chain import KinematicChain
@@ -31,7 +31,7 @@ from articulate_ssl.shape.articulated_shape import ArticulatedShape
 MIN_CLOUDS = 8  # as a choice: fewer were not tried
 _ROUNDS = 3  # of labels and adjustment; the third gained .003 of IoU on a chest, the second .07
 _POINTS = 1024  # of every cloud in these rounds
-_LABELLED = 2048  # of every cloud in the end
+LABELLED = 2048  # of every cloud in the end
 # Coarse discovery, in a sixth of the time that a category takes.
 _EFFORT = {"starts": 6, "rounds": 1, "cycles": 6}
 _REFERENCES = (1, 3)  # tried as the template; more where one leaves too much unexplained
@@ -126,16 +126,33 @@ def _attempt(
     found = discover(clouds, num_parts, joint_type, options)
     joints = found.shape.joints
     joints = replace(joints, axis=joints.axis.double(), pivot=joints.pivot.double())
-    placed = Placed(joints, found.base.double(), found.state.double())
+    return refined(surfaces, Placed(joints, found.base.double(), found.state.double()), part_points)
+
+
+def refined(
+    surfaces: list[Surface],  # n clouds of one object
+    placed: Placed,  # float64, roughly
+    part_points: int,
+    votes: np.ndarray | None = None,  # [n, N, K] shares of what else says which parts their leading points are of
+) -> OneObject:
+    """Labels and adjustment in turn, then the object. With votes, parts keep their names, and a base its own.
+
+    Raises:
+        DiscoveryError: if a part has lost its points.
+    """
+    thin = [surface.thinned(_POINTS) for surface in surfaces]
     for step in range(_ROUNDS):
         _announce(_COARSE_STAGES + step, f"round {step + 1} of {_ROUNDS}")
-        thin = [surface.thinned(_POINTS) for surface in surfaces]
-        _, probability = _labelled(surfaces, placed, _POINTS)
-        label = _kept_parts(probability)
-        # Bodies have more surface than what moves on them.
-        placed = adjusted(rooted_at(placed, int(np.bincount(label.ravel()).argmax())), thin, label)
+        if votes is None:
+            label = _kept_parts(_labelled(surfaces, placed, _POINTS)[1])
+            # Bodies have more surface than what moves on them.
+            placed = rooted_at(placed, int(np.bincount(label.ravel()).argmax()))
+        else:  # at first places are too rough to say anything
+            probability = _labelled(surfaces, placed, _POINTS, votes)[1] if step else votes[:, :_POINTS]
+            label = _kept_parts(probability)
+        placed = adjusted(placed, thin, label)
     _announce(_COARSE_STAGES + _ROUNDS, "fusing")
-    cost, probability = _labelled(surfaces, placed, _LABELLED)
+    cost, probability = _labelled(surfaces, placed, LABELLED, votes)
     label = _kept_parts(probability)
     return _fused(placed, surfaces, label, probability, cost, part_points)
 
@@ -144,11 +161,14 @@ def _announce(done: int, name: str) -> None:
     announce(log, Stage("one object", name, done, _STAGES))
 
 
-def _labelled(surfaces: list[Surface], placed: Placed, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _labelled(
+    surfaces: list[Surface], placed: Placed, count: int, votes: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Costs and probabilities of every part [n, count, K] for the leading points of every cloud."""
     count = min(count, len(surfaces[0].points))
     cost = moving_costs(surfaces, placed.pose.numpy(), count)
-    return cost, np.stack([spread_labels(s.thinned(count), c) for s, c in zip(surfaces, cost, strict=True)])
+    said = believed(cost, None if votes is None else votes[:, :count])
+    return cost, np.stack([spread_labels(s.thinned(count), own) for s, own in zip(surfaces, said, strict=True)])
 
 
 def _kept_parts(probability: np.ndarray) -> np.ndarray:

@@ -49,6 +49,13 @@ def test_parts_slide_as_a_whole_along_their_axes():
     assert (along[:, None] - along).abs()[0, 1:].min() > 0.01 and (along[1] - along[2]).abs() > 0.01
 
 
+def test_many_clouds_have_few_copies():
+    labelled, joints = _standing(0.2, seed=0)
+    for times, copies in ((1, 16), (100, 10), (300, 4)):
+        many = LabelledClouds(labelled.points[:, :8].repeat(times, 1, 1), labelled.part[:, :8].repeat(times, 1))
+        assert len(varied(many, joints, _generator()).points) == 4 * times * (1 + copies)
+
+
 def test_chests_of_other_heights_and_states_are_labelled_better():
     labelled, joints = _standing(0.32, seed=0, limit=0.05)
     asked, _ = _standing(0.2, seed=1, limit=0.5)

@@ -223,3 +223,26 @@ def test_labels_are_saved_and_decide_which_part_points_are_of(labelled):
     assert (parts[0] == data.part[:256]).float().mean() > 0.85
     other = torch.tensor([0, 2, 1])[parts[1]]
     assert (other == data.part[:256]).float().mean() > 0.85
+
+
+def test_votes_follow_faces_and_points_have_those_of_the_nearest(labelled, monkeypatch):
+    data = _chests(2, seed=6)
+    noise = torch.rand(4, 2048, 3, generator=torch.Generator().manual_seed(0))
+    clean = torch.nn.functional.one_hot(data.part, 3).float()
+
+    def votes(self, boxes, num_parts, points):
+        return (0.6 * clean + noise).clamp(max=1.2)[:, : points.shape[1]] / 3
+
+    monkeypatch.setattr(LabelledClouds, "votes", votes)
+    said = (votes(None, None, 3, data.points).argmax(dim=-1) == data.part).float().mean()
+    nearly = data.points[:, 5:105] + 1e-5
+    found = labelled.search(CHAIN, data.points, nearly).votes.argmax(dim=-1)
+    assert (found == data.part[5:105]).float().mean() > said + 0.05
+
+
+def test_an_object_is_understood_and_may_be_kept(labelled):
+    data = _chests(8, seed=7)
+    understood = labelled.understood(CHAIN, data.points)
+    assert understood.points.shape == (8, 2048, 3) and (understood.part == data.part).float().mean() > 0.97
+    standing, _, _ = unit_boxes(transform_points(torch.linalg.inv(data.base), data.points))
+    assert (understood.points - standing).abs().max() < 0.2

@@ -3,7 +3,7 @@
 import numpy as np
 from articulated_objects import DRAWER, clouds
 
-from articulate_ssl.discovery.one_object.moving_labels import moving_costs, spread_labels
+from articulate_ssl.discovery.one_object.moving_labels import believed, moving_costs, spread_labels
 from articulate_ssl.discovery.one_object.surface import Surface
 from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.shape.joints import Joints
@@ -31,7 +31,7 @@ def test_labels_that_spread_along_faces_are_better_than_those_of_single_points()
     surfaces, pose, part = _world()
     cost = moving_costs(surfaces, pose, 2048)
     alone = (cost.argmin(axis=-1) == part).mean()
-    probability = np.stack([spread_labels(s, c) for s, c in zip(surfaces, cost, strict=True)])
+    probability = np.stack([spread_labels(s, said) for s, said in zip(surfaces, believed(cost), strict=True)])
     np.testing.assert_allclose(probability.sum(axis=-1), 1, atol=1e-9)
     assert (probability.argmax(axis=-1) == part).mean() > alone + 0.02
 
@@ -42,4 +42,14 @@ def test_an_undecided_face_follows_its_end():
     strip = Surface.of(np.column_stack([rng.random(400), 0.1 * rng.random(400), np.zeros(400)]))
     cost = np.zeros((400, 2))
     cost[strip.points[:, 0] > 0.9, 0] = 0.02
-    assert (spread_labels(strip, cost).argmax(axis=1) == 1).mean() > 0.99
+    assert (spread_labels(strip, believed(cost)).argmax(axis=1) == 1).mean() > 0.99
+
+
+def test_what_else_is_said_of_points_counts_where_motion_says_nothing():
+    cost = np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 0.02], [0.02, 0.0]])
+    votes = np.array([[0.9, 0.1], [0.1, 0.9], [0.1, 0.9], [1.0, 0.0]])
+    alone, both = believed(cost), believed(cost, votes)
+    np.testing.assert_allclose(alone.sum(axis=-1), 1)
+    np.testing.assert_allclose(both.sum(axis=-1), 1)
+    np.testing.assert_allclose(alone[:2], 0.5)
+    assert both.argmax(axis=-1).tolist() == [0, 1, 0, 1]

@@ -1,0 +1,46 @@
+"""How `inference.sliding_search` gets clouds of more objects whose points have parts: in the multi-state setting.
+
+No label is read, but which clouds show the same object is known, as where discovery found a few objects from their
+clouds (`discovery.grouped`). What these say of other objects is confirmed by how each of those moves
+(`discovery.one_object.as_others`), in a third of the time that discovery takes.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from articulate_ssl.discovery.discover import DiscoveryError
+from articulate_ssl.discovery.one_object.find import MIN_CLOUDS
+from articulate_ssl.discovery.references import evenly_chosen
+from articulate_ssl.discovery.similar_clouds import LabelledClouds
+from articulate_ssl.ops.progress import announced, tell
+
+if TYPE_CHECKING:
+    from articulate_ssl.training.module import ArticulatedPoseModule
+
+log = logging.getLogger(__name__)
+
+
+@torch.no_grad()
+def learn_objects(
+    module: ArticulatedPoseModule,
+    clouds: Tensor,  # [n, N, 3] farthest-point order, dense
+    instance: Tensor,  # [n] which object each shows
+) -> None:
+    """Keep the clouds of every object that is understood, if that are more than there were."""
+    sliding, chain = module.estimator.sliding, module.articulated.category.chain()
+    rows = [(instance == one).nonzero()[:, 0] for one in instance.unique()]
+    rows = [evenly_chosen(own, MIN_CLOUDS) for own in rows if len(own) >= MIN_CLOUDS]
+    found = []
+    for own in announced(log, "parts of more objects", rows):
+        try:
+            found.append(sliding.understood(chain, clouds[own]))
+        except DiscoveryError as error:
+            log.info("an object is left out: %s", error)
+    tell(log, "parts of %d of %d objects are understood", len(found), len(rows))
+    if sum(len(one.part) for one in found) > len(sliding.labelled):
+        sliding.learn_labelled(LabelledClouds(*(torch.cat(some) for some in zip(*found, strict=True))))
