@@ -49,7 +49,7 @@ _LEADING = 4  # turns among which a network chooses, if one was taught
 _FITTED_POINTS = 1024  # of a cloud, to which the shape is fitted
 _LABELLED_OF_CLOUD = 2048  # leading points of a cloud that have parts by what labelled clouds say
 _PLACED_POINTS = 256  # of the shape, whose offsets are tried
-_SPREAD = 30.0  # how far votes spread along faces: of 60 clouds, 10 to 100 were alike (step 173)
+_SPREAD = 30.0  # how far votes spread along faces: of 80 clouds, 10 to 100 were alike (step 173)
 _CYCLES = 4  # of the descent on every candidate; twice as many on the best
 
 
