@@ -2,7 +2,8 @@
 
 No label is read, but which clouds show the same object is known, as where discovery found a few objects from their
 clouds (`discovery.grouped`). What these say of other objects is confirmed by how each of those moves
-(`discovery.one_object.as_others`), in a third of the time that discovery takes.
+(`discovery.one_object.as_others`), in a third of the time that discovery takes. An object that discovery found itself
+is asked about again, and its own clouds are among those that answer.
 """
 
 from __future__ import annotations

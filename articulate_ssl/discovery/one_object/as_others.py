@@ -2,8 +2,8 @@
 
 Discovery (`find`) knows nothing of an object but its clouds, and starts from guesses. Where others are understood, they
 say which part points are of, about; where parts are follows, then the rounds of discovery make it exact, in which what
-others say counts as much as how points move. That takes a third of the time, finds objects of which discovery finds
-nothing, and calls parts as others do (docs/experiments.md, step 173).
+others say counts as much as how points move. That takes a third of the time, was right of a chest that discovery had
+wrong, and calls parts as others do (docs/experiments.md, step 173).
 """
 
 from __future__ import annotations
