@@ -7,6 +7,7 @@ from torch import Tensor
 
 from articulate_ssl.geometry.se3 import transform_points
 from articulate_ssl.inference.prediction import Prediction
+from articulate_ssl.inference.votes import Votes
 from articulate_ssl.losses.reconstruction import distances_to_parts
 from articulate_ssl.network.hypotheses import Hypotheses
 
@@ -23,7 +24,8 @@ def as_prediction(
     margin: Tensor,  # [B]
     posterior_scale: float,
     part_neighbours: int,
-    votes: Tensor | None = None,  # [B, N, K] which parts points are of, beside the nearest of the posed ones
+    votes: Votes | None = None,  # which parts points are of, beside the nearest of the posed ones
+    dense: Tensor | None = None,  # [B, P, 3] more points that are labelled
 ) -> Prediction:
     """One hypothesis of every cloud, packaged.
 
@@ -37,15 +39,12 @@ def as_prediction(
     chain = chosen.chain
     parent = torch.tensor(chain.parent, device=points.device)
     posed = chosen.posed()[:, 0]
-    to_part = distances_to_parts(points, posed, part_neighbours)
+    probability = _probability(points, posed, posterior_scale, part_neighbours, votes)
+    every = None if dense is None else _probability(dense, posed, posterior_scale, part_neighbours, votes).argmax(-1)
     shape = (len(points), len(parent))
     axis, pivot = joint_lines(chosen, pose)
-    part_id, probability = to_part.argmin(dim=-1), (to_part.square() / (-2 * posterior_scale**2)).softmax(-1)
-    if votes is not None:
-        probability = torch.lerp(probability, votes, _VIEWS_SAY)
-        part_id = probability.argmax(dim=-1)
     return Prediction(
-        part_id=part_id,
+        part_id=probability.argmax(dim=-1),
         part_probability=probability,
         part_pose=part_pose,
         part_shape=chosen.part_shape,
@@ -61,7 +60,21 @@ def as_prediction(
         canonical_pivot=chosen.pivot,
         reconstruction_error=distance,
         margin=margin,
+        dense_part_id=every,
     )
+
+
+def _probability(
+    points: Tensor,  # [B, N, 3]
+    posed: Tensor,  # [B, K, M, 3]
+    posterior_scale: float,
+    part_neighbours: int,
+    votes: Votes | None,
+) -> Tensor:  # [B, N, K]
+    """That points are of parts."""
+    to_part = distances_to_parts(points, posed, part_neighbours)
+    probability = (to_part.square() / (-2 * posterior_scale**2)).softmax(-1)
+    return probability if votes is None else torch.lerp(probability, votes.at(points), _VIEWS_SAY)
 
 
 def joint_lines(

@@ -55,6 +55,7 @@ from articulate_ssl.inference.sliding_search import SlidingSearch
 from articulate_ssl.inference.state_range import StateRange
 from articulate_ssl.inference.two_ways import TwoWays
 from articulate_ssl.inference.view_search import ViewSearch
+from articulate_ssl.inference.votes import Votes
 from articulate_ssl.losses.reconstruction import distances_to_parts
 from articulate_ssl.network.articulated_network import ArticulatedNetwork
 from articulate_ssl.network.heads.shape import CanonicalShape
@@ -172,7 +173,7 @@ class PoseEstimator:
             refine: Register at test time, or not; None does what the options say.
             dense: What a decision between two explanations and a search for sliding parts read, an even sample of the
                 surface and about as many points as in training; without them there is neither, and without
-                registration no search.
+                registration no search. All are labelled, too.
 
         Raises:
             ValueError: if a cloud has NaN or infinite points.
@@ -234,7 +235,7 @@ class PoseEstimator:
             if registers and fits:
                 chosen, other, margin = self.final.within_limits(chosen, other, margin, points, dense)
             rival = self._packaged(other, points, torch.zeros_like(margin))
-            return self._packaged(chosen, points, margin, votes), rival, error
+            return self._packaged(chosen, points, margin, votes, dense), rival, error
 
     def _as_most_are(
         self,
@@ -254,7 +255,8 @@ class PoseEstimator:
         base = turned.base_pose[rows, None]
         start = self.articulated.category_at(base, middle.expand(len(rows), 1, -1))
         tried = self.final.in_proportion(self.registration.freed(start, own), own, seen)
-        packaged = self.hinge_sides.counted_from_closed(self._packaged(tried, own, turned.margin[rows]))
+        packaged = self._packaged(tried, own, turned.margin[rows], dense=seen)
+        packaged = self.hinge_sides.counted_from_closed(packaged)
         as_turned = angle_to(tried.base[..., :3, :3], base[:, 0, :3, :3])[:, 0] < ANOTHER_WAY
         fits = packaged.reconstruction_error < turned.reconstruction_error[rows]
         better = (as_turned & fits & self.states.contains(tried.state[:, 0])).nonzero()[:, 0]
@@ -273,7 +275,7 @@ class PoseEstimator:
 
     def _chosen(
         self, points: Tensor, num_points: int, registers: bool, dense: Tensor | None
-    ) -> tuple[Hypotheses, Hypotheses, Tensor, Tensor | None]:  # H = 1, H = 1, [B], [B, N, K]
+    ) -> tuple[Hypotheses, Hypotheses, Tensor, Votes | None]:  # H = 1, H = 1, [B]
         """What is decided for, its rival, the margin between them, and parts of points as labelled clouds vote."""
         votes = None
         if registers and self.view_search.learnt:
@@ -342,7 +344,7 @@ class PoseEstimator:
         points: Tensor,  # [B, N, 3]
         dense: Tensor,  # [B, P, 3]
         num_points: int | None = None,
-    ) -> tuple[Hypotheses, Hypotheses, Tensor, Tensor | None]:  # H = 1, H = 1, [B], [B, N, K]
+    ) -> tuple[Hypotheses, Hypotheses, Tensor, Votes | None]:  # H = 1, H = 1, [B]
         """The category's shape where the search for sliding parts finds it, and its rival.
 
         Which way round clouds are, the search decides; with `num_points` by a network, if that was taught, and the
@@ -352,7 +354,7 @@ class PoseEstimator:
             Both, the margin between them, and which parts labelled clouds say that points are of, if there are any.
         """
         decides = num_points is not None
-        slid = self.sliding.search(self.articulated.category.chain(), dense, points, decides)
+        slid = self.sliding.search(self.articulated.category.chain(), dense, decides)
         shape, base, state, margin, votes = slid
         clouds, count = base.shape[:2]
         rows, parts = torch.arange(clouds, device=points.device), shape.points.unflatten(1, (shape.num_parts, -1))
@@ -376,7 +378,7 @@ class PoseEstimator:
         self,
         points: Tensor,  # [B, N, 3]
         num_points: int | None = None,
-    ) -> tuple[Hypotheses, Hypotheses, Tensor, Tensor]:  # H = 1, H = 1, [B], [B, N, K]
+    ) -> tuple[Hypotheses, Hypotheses, Tensor, Votes]:  # H = 1, H = 1, [B]
         """The category's shape, registered from where the search among simulated views finds it, and its rival.
 
         Which way round objects are, the search decides. With `num_points` the network's hypotheses that are turned
@@ -420,7 +422,7 @@ class PoseEstimator:
                 return self._fitted(found, other, margin, points, dense, votes)
             if dense is not None and self.sliding.learnt:
                 found, _, margin, votes = self._slid(points, dense)
-                return self._packaged(found, points, margin, votes), self.final.distance(found, points)
+                return self._packaged(found, points, margin, votes, dense), self.final.distance(found, points)
             found, other, margin = self._best(self.final.search(points))
             if dense is not None and self.two_ways.learnt:
                 found, other, margin = self.decision.by_relief(found, points, dense, registers=True)
@@ -433,20 +435,21 @@ class PoseEstimator:
         margin: Tensor,  # [B]
         points: Tensor,  # [B, N, 3]
         dense: Tensor | None,  # [B, P, 3]
-        votes: Tensor | None = None,  # [B, N, K]
+        votes: Votes | None = None,
     ) -> tuple[Prediction, Tensor]:
         """Explanations in the clouds' proportions, packaged; and their errors [B] before that."""
         shown, _, margin = self.final.within_limits(one, rival, margin, points, dense)
-        return self._packaged(shown, points, margin, votes), self.final.distance(one, points)
+        return self._packaged(shown, points, margin, votes, dense), self.final.distance(one, points)
 
     def _packaged(
         self,
         chosen: Hypotheses,  # H = 1
         points: Tensor,  # [B, N, 3]
         margin: Tensor,  # [B]
-        votes: Tensor | None = None,  # [B, N, K]
+        votes: Votes | None = None,
+        dense: Tensor | None = None,  # [B, P, 3]
     ) -> Prediction:
         """See `as_prediction`."""
         neighbours = self.inference.part_neighbours or 1
         distance = self.final.distance(chosen, points)
-        return as_prediction(chosen, points, distance, margin, self.posterior_scale, neighbours, votes)
+        return as_prediction(chosen, points, distance, margin, self.posterior_scale, neighbours, votes, dense)

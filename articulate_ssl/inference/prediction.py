@@ -36,6 +36,8 @@ class Prediction:
             way: 1 - error / rival's error; 0 if a rival is as good, 1 if none was considered. No probability. Where
             relief or a network decided between two explanations (`two_ways`, `surface_decision`), how much likelier
             than not this one is; where clouds may show mirror images (`handedness`), at most as much.
+        dense_part_id: [B, P] part of every point of the dense clouds; P = 0 where these were not given, or nothing
+            labels them.
     """
 
     part_id: Tensor
@@ -54,6 +56,11 @@ class Prediction:
     canonical_pivot: Tensor
     reconstruction_error: Tensor
     margin: Tensor
+    dense_part_id: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        if self.dense_part_id is None:
+            object.__setattr__(self, "dense_part_id", self.part_id[:, :0])
 
     @property
     def num_parts(self) -> int:
@@ -87,6 +94,7 @@ class ScanEstimate:
         prediction: B = 1, normalised units.
         rival: The best hypothesis that is turned another way, B = 1; None if none was considered.
         points: [N, 3] the normalised points that both label.
+        dense: [P, 3] those that `Prediction.dense_part_id` is of.
         center: [3], in the frame of the scan.
         scale: Units of the scan per normalised unit.
         probability: That orientation and parts are right; None if that has not been learnt (`inference.confidence`).
@@ -98,5 +106,6 @@ class ScanEstimate:
     points: np.ndarray
     center: np.ndarray
     scale: float
+    dense: np.ndarray | None = None
     probability: float | None = None
     unlike: float | None = None

@@ -204,12 +204,14 @@ class ScanPrediction:
 
 
 def part_of_points(
-    prediction: Prediction,  # B = 1, of `points`
-    points: np.ndarray,  # [N, 3] the network's input
-    cloud: np.ndarray,  # [M, 3] the whole scan, same frame as `points`
+    estimate: ScanEstimate,
+    cloud: np.ndarray,  # [M, 3] the user's scan, not normalised
 ) -> np.ndarray:  # [M] part indices
-    """Part of every point of the whole scan: that of the nearest point that the network saw."""
-    return prediction.part_id[0].cpu().numpy()[kd_tree(points).query(cloud)[1]]
+    """Part of every point of the whole scan: that of the nearest point that was labelled."""
+    points, part = estimate.points, estimate.prediction.part_id
+    if estimate.dense is not None:
+        points, part = estimate.dense, estimate.prediction.dense_part_id
+    return part[0].cpu().numpy()[kd_tree(points).query((cloud - estimate.center) / estimate.scale)[1]]
 
 
 def in_scan_frame(
@@ -234,7 +236,7 @@ def in_scan_frame(
     return ScanPrediction(
         prediction=metric,
         cloud=cloud,
-        part_id=part_of_points(prediction, estimate.points, (cloud - center) / scale),
+        part_id=part_of_points(estimate, cloud),
         limits=torch.where(prismatic, state_range.cpu().double() * scale, state_range.cpu().double()),
         category=category,
         checkpoint=checkpoint,

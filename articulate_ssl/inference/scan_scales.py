@@ -11,7 +11,7 @@ from torch import Tensor
 from articulate_ssl.inference.confidence import relative_error
 from articulate_ssl.inference.point_cloud_io import normalise_cloud
 from articulate_ssl.inference.pose_estimation import PoseEstimator
-from articulate_ssl.inference.prediction import ScanEstimate, concatenate
+from articulate_ssl.inference.prediction import ScanEstimate
 
 # Standard deviations, over the training clouds, by which the scale of a scan may differ from their mean.
 SCALE_STARTS = (-1.5, -0.75, 0.0, 0.75, 1.5)
@@ -59,27 +59,28 @@ def _predict_together(
         scales.append([size / start for start in starts])
         tried += [torch.as_tensor(cloud / scale, dtype=torch.float32) for scale in scales[-1]]
     batch = torch.stack(tried).to(device)
-    if estimator.sliding.learnt:  # which reads all points of a scan, and scans differ in number
-        every = zip(clouds, centers, scales, batch.split(len(starts)), strict=True)
-        found = [
-            estimator.predict_with_rivals(some, num_points, refine, _scaled(points, center, scale).to(batch))
-            for points, center, scale, some in every
-        ]
-        prediction, rival = (concatenate(list(several)) for several in zip(*found, strict=True))
+    if estimator.sliding.learnt:  # which reads all points of a scan
+        copies = [_scaled(*scan).to(batch) for scan in zip(clouds, centers, scales, strict=True)]
+        both = zip(batch.split(len(starts)), copies, strict=True)
+        found = [estimator.predict_with_rivals(some, num_points, refine, dense) for some, dense in both]
     else:
-        prediction, rival = estimator.predict_with_rivals(batch, num_points, refine)
-    best = relative_error(prediction, batch).view(-1, len(starts)).argmin(dim=1)
-    rows = torch.arange(len(clouds), device=best.device) * len(starts) + best
-    batch, prediction, rival = batch[rows], prediction[rows], rival[rows]
-    scales = [scale[start] for scale, start in zip(scales, best.tolist(), strict=True)]
+        copies, whole = [None] * len(clouds), estimator.predict_with_rivals(batch, num_points, refine)
+        scans = [slice(first, first + len(starts)) for first in range(0, len(batch), len(starts))]
+        found = [tuple(one[rows] for one in whole) for rows in scans]
+    tried = zip(found, batch.split(len(starts)), copies, centers, scales, strict=True)
     estimates = []
-    for i, (points, center, scale) in enumerate(zip(clouds, centers, scales, strict=True)):
-        one, other = prediction[i : i + 1], rival[i : i + 1]
+    for points, ((prediction, rival), some, dense, center, scale) in zip(clouds, tried, strict=True):
+        best = int(relative_error(prediction, some).argmin())
+        own = slice(best, best + 1)
+        one, other, some = prediction[own], rival[own], some[own]
         if estimator.reads_dense:
-            dense = _scaled(points, center, [scale]).to(batch)
-            one, other = estimator.predict_with_rivals(batch[i : i + 1], num_points, refine, dense)
+            dense = _scaled(points, center, scale[own]).to(batch)
+            one, other = estimator.predict_with_rivals(some, num_points, refine, dense)
+        elif dense is not None:
+            dense = dense[own]
+        every = dense[0].cpu().numpy() if one.dense_part_id.shape[1] else None
         other = other if one.margin < 1 else None
-        estimates.append(ScanEstimate(one, other, batch[i].cpu().numpy(), center, scale))
+        estimates.append(ScanEstimate(one, other, some[0].cpu().numpy(), center, scale[best], every))
     return estimates
 
 

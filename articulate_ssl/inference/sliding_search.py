@@ -34,7 +34,7 @@ from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.screw import PRISMATIC
 from articulate_ssl.geometry.se3 import se3
 from articulate_ssl.inference.surface_decision import WithSurface
-from articulate_ssl.ops.chamfer import nearest_index
+from articulate_ssl.inference.votes import Votes
 from articulate_ssl.ops.few_bytes import from_few_bytes, in_few_bytes
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.joints import Joints
@@ -47,7 +47,6 @@ _PROPORTIONS = 4  # copies of every cloud by which turns are decided: wrong 9 % 
 _TURNS = 2  # the likeliest, and its rival
 _LEADING = 4  # turns among which a network chooses, if one was taught
 _FITTED_POINTS = 1024  # of a cloud, to which the shape is fitted
-_LABELLED_OF_CLOUD = 2048  # leading points of a cloud that have parts by what labelled clouds say
 _PLACED_POINTS = 256  # of the shape, whose offsets are tried
 _SPREAD = 30.0  # how far votes spread along faces: of 80 clouds, 10 to 100 were alike (step 173)
 _CYCLES = 4  # of the descent on every candidate; twice as many on the best
@@ -61,14 +60,14 @@ class Slid(NamedTuple):
         base: [B, 2, 4, 4]
         state: [B, 2, J]
         margin: [B] how much likelier than the other the likelier turn is.
-        votes: [B, M, K] share of the labelled clouds most alike in which a point is of each part, if there are any.
+        votes: Which parts points of the clouds are of in the labelled clouds most alike, if there are any.
     """
 
     shape: ArticulatedShape
     base: Tensor
     state: Tensor
     margin: Tensor
-    votes: Tensor | None
+    votes: Votes | None
 
 
 class SlidingSearch(WithSurface):
@@ -189,41 +188,36 @@ class SlidingSearch(WithSurface):
         self,
         chain: KinematicChain,
         clouds: Tensor,  # [B, N, 3] with all their points
-        points: Tensor,  # [B, M, 3] of the same clouds, whose parts are asked for
         decides: bool = True,
     ) -> Slid:
         """The shape in every cloud, in each of two turns, the likelier first (`turns`)."""
-        device, clouds, points = clouds.device, clouds.cpu().clone(), points.cpu().clone()  # no inference tensors
+        device, clouds = clouds.device, clouds.cpu().clone()  # no inference tensor
         turn, margin = self.turns(clouds, decides)
         copies = torch.einsum("bcij,bnj->bcni", turn, clouds).flatten(0, 1)
-        points = torch.einsum("bcij,bmj->bcmi", turn, points).flatten(0, 1)
-        fit, votes = self._fitted(self._shape(chain), copies, points)
+        fit, share = self._fitted(self._shape(chain), copies)
         back = se3(turn.mT, turn.new_zeros(*turn.shape[:2], 3))
         base, state = (value.unflatten(0, turn.shape[:2]).to(device) for value in (fit.base, fit.state))
         found = fit.instances()
         joints = found.joints
         lines = {name: getattr(joints, name).to(device) for name in ("axis", "pivot", "limits")}
         found = ArticulatedShape(found.points.to(device), found.label.to(device), replace(joints, **lines))
-        votes = None if votes is None else votes.to(device)
+        votes = None if share is None else Votes(clouds.to(device), share.to(device))
         return Slid(found, back.to(device) @ base, state, margin.to(device), votes)
 
     def _fitted(
         self,
         shape: ArticulatedShape,
         clouds: Tensor,  # [2 B, N, 3] turned
-        points: Tensor,  # [2 B, M, 3] turned alike
-    ) -> tuple[InstanceFit, Tensor | None]:
-        """The shape in the clouds, and which parts points are of in the likelier turn, if similar clouds say it."""
+    ) -> tuple[InstanceFit, Tensor | None]:  # , [B, M, K]
+        """The shape in the clouds, and which parts points are of in the likelier turn, if others say it."""
         if not len(self.labelled):
             axes = torch.eye(3).to(clouds).expand(len(self.points), 3, 3)
             generator, few = torch.Generator().manual_seed(0), clouds[:, :_FITTED_POINTS].contiguous()
             return fit_slides(shape, axes, few, _PLACED_POINTS, _CYCLES, generator), None
-        boxes, shown = unit_boxes(clouds)[0], clouds[:, :_LABELLED_OF_CLOUD]
-        votes = self._varied(shape.joints).votes(boxes[:, :ASKING], shape.num_parts, boxes[:, : shown.shape[1]])
+        boxes = unit_boxes(clouds)[0]
+        votes = self._varied(shape.joints).votes(boxes[:, :ASKING], shape.num_parts, boxes)
         votes = torch.stack([_along_faces(*some) for some in zip(clouds, votes, strict=True)])
-        fit = fit_part_boxes(shape, shown, votes.argmax(dim=-1))
-        nearest = nearest_index(points[::_TURNS].contiguous(), shown[::_TURNS].contiguous())
-        return fit, votes[::_TURNS].gather(1, nearest[..., None].expand(-1, -1, shape.num_parts))
+        return fit_part_boxes(shape, clouds, votes.argmax(dim=-1)), votes[::_TURNS]
 
     @torch.no_grad()
     def understood(

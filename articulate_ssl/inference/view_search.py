@@ -19,6 +19,7 @@ from torch.nn.functional import one_hot
 from articulate_ssl.discovery.registration import register_rigid
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.inference.candidates import rivals
+from articulate_ssl.inference.votes import Votes
 from articulate_ssl.ops.chamfer import nearest_distance, nearest_index
 from articulate_ssl.ops.few_bytes import from_few_bytes, in_few_bytes
 
@@ -39,13 +40,13 @@ class Seen(NamedTuple):
             side (the same, if there is none).
         state: [B, 2, J] joint states.
         margin: [B] between the two, 1 if they are the same (`Prediction.margin`).
-        votes: [B, N, K] share of the views most like the cloud in which a point is of each part.
+        votes: Which parts points are of in the views most like the cloud.
     """
 
     base: Tensor
     state: Tensor
     margin: Tensor
-    votes: Tensor
+    votes: Votes
 
 
 class ViewSearch(nn.Module):
@@ -115,7 +116,7 @@ class ViewSearch(nn.Module):
         best = error.argmin(dim=1)
         rival, margin = rivals(error, pose, best, torch.ones_like(error, dtype=torch.bool))
         both, rows = torch.stack([best, rival], dim=1), torch.arange(len(points), device=points.device)[:, None]
-        return Seen(pose[rows, both], state[rows, both], margin, torch.stack(votes))
+        return Seen(pose[rows, both], state[rows, both], margin, Votes(points, torch.stack(votes)))
 
     def _votes(
         self,

@@ -128,7 +128,9 @@ def chordal_mean(
 
 
 def dense_prediction(prediction: Prediction, labels: dict[str, Tensor]) -> Tensor:  # [B, P]
-    """Predicted slot of every dense point: that of its nearest input point."""
+    """Predicted slot of every dense point: as predicted, or that of its nearest input point."""
+    if prediction.dense_part_id.shape[1]:
+        return prediction.dense_part_id.long()
     nearest = nearest_index(labels["dense_points"], labels["points"])[1]
     return prediction.part_id.long().gather(1, nearest)
 
@@ -286,6 +288,8 @@ def check_labels(prediction: Prediction, labels: dict[str, Tensor]) -> None:
         "part_center": (clouds, parts, 3),
         "dense_part_id": tuple(labels["dense_points"].shape[:2]),
     }
+    if prediction.dense_part_id.shape[1]:
+        expected["dense_points"] = (*prediction.dense_part_id.shape, 3)
     if predicts_joints(prediction):
         expected["joint_axis"] = (*prediction.joint_state.shape, 3)
     for name, shape in expected.items():

@@ -3,21 +3,26 @@
 No label is read, but which clouds show the same object is known, as where discovery found a few objects from their
 clouds (`discovery.grouped`). What these say of other objects is confirmed by how each of those moves
 (`discovery.one_object.as_others`), in a third of the time that discovery takes. An object that discovery found itself
-is asked about again, and its own clouds are among those that answer.
+is asked about again, and its own clouds are among those that answer. In the end all are named alike: names that the
+few gave to kinds of objects that were rare among them may be as they came.
 """
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
+from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from articulate_ssl.discovery.discover import DiscoveryError
+from articulate_ssl.discovery.named_alike import ObjectParts, named_alike
 from articulate_ssl.discovery.one_object.find import MIN_CLOUDS
 from articulate_ssl.discovery.references import evenly_chosen
 from articulate_ssl.discovery.similar_clouds import LabelledClouds
+from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.ops.progress import announced, tell
 
 if TYPE_CHECKING:
@@ -44,4 +49,15 @@ def learn_objects(
             log.info("an object is left out: %s", error)
     tell(log, "parts of %d of %d objects are understood", len(found), len(rows))
     if sum(len(one.part) for one in found) > len(sliding.labelled):
-        sliding.learn_labelled(LabelledClouds(*(torch.cat(some) for some in zip(*found, strict=True))))
+        sliding.learn_labelled(_named_alike(found, chain))
+
+
+def _named_alike(found: Sequence[LabelledClouds], chain: KinematicChain) -> LabelledClouds:
+    """Clouds of several objects, their parts named by one rule, which calls most points what they were called."""
+    count = chain.num_parts
+    before = [one.part.long() for one in found]
+    objects = [ObjectParts(one.points, part, chain.root) for one, part in zip(found, before, strict=True)]
+    part = torch.cat([name[one] for name, one in zip(named_alike(objects, count), before, strict=True)])
+    agree = torch.bincount((part * count + torch.cat(before)).flatten(), minlength=count**2).view(count, count)
+    own = torch.from_numpy(linear_sum_assignment(-agree.numpy())[1])
+    return LabelledClouds(torch.cat([one.points for one in found]), own[part])

@@ -23,6 +23,8 @@ from datamodules.atomic import atomic_write
 FILE_NAME = "prediction.npz"
 FORMAT = 1
 PREDICTIONS = ("prediction", "rival")
+# All but parts of the points that were read of a scan: `ScanPrediction.part_id` are those of all its points.
+_SAVED = tuple(field.name for field in fields(Prediction) if field.name != "dense_part_id")
 
 
 class ResultFolderError(ValueError):
@@ -36,7 +38,7 @@ def write(result: ScanPrediction, folder: Path) -> list[Path]:
     for field in fields(result):
         value = getattr(result, field.name)
         if isinstance(value, Prediction):
-            entries |= {f"{field.name}.{f.name}": getattr(value, f.name).numpy() for f in fields(value)}
+            entries |= {f"{field.name}.{name}": getattr(value, name).numpy() for name in _SAVED}
         elif value is not None:
             entries[field.name] = np.asarray(value)
     with atomic_write(file) as opened:
@@ -69,7 +71,7 @@ def _read(entries: dict[str, np.ndarray], file: Path) -> ScanPrediction:
     values = {}
     for field in fields(ScanPrediction):
         if field.name in PREDICTIONS and any(name.startswith(f"{field.name}.") for name in entries):
-            names = {f.name: f"{field.name}.{f.name}" for f in fields(Prediction)}
+            names = {name: f"{field.name}.{name}" for name in _SAVED}
             _check_names(names.values(), entries, file)
             values[field.name] = Prediction(**{f: torch.from_numpy(entries[name]) for f, name in names.items()})
         elif field.name in entries:

@@ -1,48 +1,78 @@
-"""Parts of objects get common names by where they lie, whatever each object calls them."""
+"""Parts of objects get common names by the order in which they repeat, whatever each object calls them."""
 
+from itertools import permutations
+
+import pytest
 import torch
 
 from articulate_ssl.discovery.named_alike import ObjectParts, named_alike
+from articulate_ssl.geometry.rotation_group import rotation_group
 
-CENTERS = torch.tensor([[0.0, 0, -0.4], [0.2, 0, -0.1], [0.2, 0, 0.1], [0.2, 0, 0.4]])  # a body, three drawers
+# Seen from the front, to which z points: x right, y up. What is read first comes first, lines from top to bottom.
+STACK = ((0.0, 0.4), (0.0, 0.1), (0.0, -0.3))
+ROW = ((-0.5, 0.3), (0.05, 0.31), (0.5, 0.29))
+# One across, then two above each other beside it: around the corner from either side.
+CORNER = ((-0.3, 0.4), (0.3, 0.4), (0.3, 0.0))
+MIRRORED = tuple((-x, y) for x, y in CORNER)
 
 
-def _object(own: list[int], generator: torch.Generator, noise: float = 0.03) -> ObjectParts:
-    """Of which part k is the common part own[k]."""
-    label = torch.arange(200).expand(3, 200) % 4
-    centers = CENTERS + noise * torch.randn(4, 3, generator=generator)
-    boxes = centers[torch.tensor(own)][label] + 0.05 * torch.randn(3, 200, 3, generator=generator)
+def _object(places, own: list[int], seed: int, root_at: float = 0.0) -> ObjectParts:
+    """Of which part k is the body, if own[k] is 0, or lies at places[own[k] - 1]; drawers stick out to the front."""
+    generator = torch.Generator().manual_seed(seed)
+    centers = torch.tensor([(root_at, 0.0, 0.0), *((x, y, 0.3) for x, y in places)])
+    label = torch.arange(400).expand(3, 400) % 4
+    spread = torch.tensor([[0.5, 0.5, 0.4], *[[0.05, 0.05, 0.4]] * 3])
+    common = torch.tensor(own)[label]
+    boxes = centers[common] + spread[common] * (2 * torch.rand(3, 400, 3, generator=generator) - 1)
     return ObjectParts(boxes, label, own.index(0))
 
 
-def test_parts_are_named_by_place():
-    generator = torch.Generator().manual_seed(0)
-    orders = [[1, 3, 0, 2], [0, 1, 2, 3], [3, 2, 1, 0], [2, 0, 3, 1]]
-    names = named_alike([_object(own, generator) for own in orders], 4)
-    assert torch.equal(names[0], torch.arange(4))  # as the first one calls them
-    first = torch.tensor(orders[0])
-    for own, name in zip(orders, names, strict=True):
-        assert torch.equal(first[name], torch.tensor(own))
+def _many() -> tuple[list[ObjectParts], list[list[int]]]:
+    orders = [list(order) for order in permutations(range(4))]
+    kinds = [STACK, STACK, ROW, STACK, CORNER, STACK, MIRRORED]
+    return [_object(kinds[i % 7], own, seed=i) for i, own in enumerate(orders)], orders
 
 
-def test_an_unusual_first_object_does_not_name_the_others_wrongly():
-    """The drawers of a desk lie beside each other: all others agree with each other all the same."""
-    generator = torch.Generator().manual_seed(1)
-    own = [0, 1, 2, 3]
-    desk = _object(own, generator, noise=0)
-    desk = desk._replace(
-        boxes=desk.boxes + torch.tensor([[0.0, 0, 0], [0, -0.3, 0.1], [0, 0, 0], [0, 0.3, -0.2]])[desk.label]
-    )
-    names = named_alike([desk, *(_object(order, generator) for order in ([0, 1, 2, 3], [0, 3, 2, 1], [0, 2, 1, 3]))], 4)
-    common = [
-        name[torch.tensor(order).argsort()]
-        for name, order in zip(names[1:], ([0, 1, 2, 3], [0, 3, 2, 1], [0, 2, 1, 3]), strict=True)
+def test_parts_of_all_kinds_are_named_in_one_order():
+    objects, orders = _many()
+    names = [
+        tuple(name[torch.tensor(own).argsort()].tolist())
+        for name, own in zip(named_alike(objects, 4), orders, strict=True)
     ]
-    assert torch.equal(common[0], common[1]) and torch.equal(common[0], common[2])
+    assert set(names) in ({(0, 1, 2, 3)}, {(0, 3, 2, 1)})
+
+
+@pytest.mark.parametrize("turn", range(24))
+def test_the_order_does_not_depend_on_how_all_stand(turn):
+    """In any frame of the collection all are read from the same end, or all from the other."""
+    rotation = rotation_group(24).elements[turn]
+    objects, orders = _many()
+    objects = [one._replace(boxes=one.boxes @ rotation.to(one.boxes).T) for one in objects]
+    names = [
+        tuple(name[torch.tensor(own).argsort()].tolist())
+        for name, own in zip(named_alike(objects, 4), orders, strict=True)
+    ]
+    assert set(names) in ({(0, 1, 2, 3)}, {(0, 3, 2, 1)})
+
+
+def test_in_the_mirror_rows_are_read_from_the_other_end():
+    """So handedness counts: what stands in a mirror is another collection."""
+    objects, orders = _many()
+    objects = [one._replace(boxes=one.boxes * torch.tensor([-1.0, 1, 1])) for one in objects]
+    names = [
+        tuple(name[torch.tensor(own).argsort()].tolist())
+        for name, own in zip(named_alike(objects, 4), orders, strict=True)
+    ]
+    assert {names[0], names[2]} == {(0, 1, 2, 3), (0, 3, 2, 1)}  # a chest and a row
 
 
 def test_roots_have_one_name_wherever_they_lie():
-    generator = torch.Generator().manual_seed(2)
-    usual, other = (_object([0, 1, 2, 3], generator) for _ in range(2))
-    names = named_alike([usual, other._replace(root=1)], 4)
-    assert int(names[1][1]) == 0 and sorted(names[1].tolist()) == [0, 1, 2, 3]
+    objects = [_object(STACK, [0, 1, 2, 3], 0), _object(STACK, [2, 0, 1, 3], 1, root_at=0.3)]
+    for name, root in zip(named_alike(objects, 4), (0, 1), strict=True):
+        assert int(name[root]) == 0 and sorted(name.tolist()) == [0, 1, 2, 3]
+
+
+def test_a_single_part_needs_no_order():
+    one = _object(STACK, [0, 1, 2, 3], 0)
+    pair = one._replace(label=(one.label > 0).long())
+    assert named_alike([pair, pair], 2)[0].tolist() == [0, 1]

@@ -51,7 +51,7 @@ def chain_of_boxes(boxes, joints, states, num_points=512, shape_points=256, seed
         reconstruction_error=torch.tensor([0.012]),
         margin=torch.tensor([0.4]),
     )
-    unknown = dict.fromkeys(("part_id", "part_probability", "joint_axis", "joint_pivot"), torch.zeros(1))
+    unknown = dict.fromkeys(("part_id", "part_probability", "joint_axis", "joint_pivot"), torch.zeros(1, 1))
     unknown["part_pose"] = torch.zeros(1, len(boxes), 4, 4)
     motion = part_motion(Prediction(**incomplete, **unknown), incomplete["joint_state"])[0]
     part_pose = base_pose @ motion @ se3(torch.eye(3).expand(len(boxes), 3, 3), assembly)

@@ -53,7 +53,7 @@ def test_unseen_chests_of_other_proportions_are_found(learnt):
     proportion = torch.tensor([1.15, 0.85, 1.0])
     standing = transform_points(torch.linalg.inv(data.base), data.points) * proportion
     points = transform_points(data.base, standing)
-    shape, base, state, margin, votes = learnt.search(CHAIN, points, points)
+    shape, base, state, margin, votes = learnt.search(CHAIN, points)
     assert votes is None  # no cloud has labels
     truth = data.base[:, None, :3, :3].expand(-1, 2, -1, -1)
     angle = roma.rotmat_geodesic_distance(base[..., :3, :3], truth).rad2deg()
@@ -98,8 +98,8 @@ def test_a_network_chooses_among_the_leading_turns_and_says_how_sure_it_is(learn
     torch.testing.assert_close(margin, (2 * (best - said.topk(2).values[:, 1])).tanh())
     # A search without a network asks none.
     assert torch.equal(search.turns(data.points, decides=False)[0], learnt.turns(data.points)[0])
-    found = search.search(CHAIN, data.points, data.points).base[:, 0, :3, :3]
-    other = search.search(CHAIN, data.points, data.points, decides=False).base[:, 0, :3, :3]
+    found = search.search(CHAIN, data.points).base[:, 0, :3, :3]
+    other = search.search(CHAIN, data.points, decides=False).base[:, 0, :3, :3]
     assert roma.rotmat_geodesic_distance(found, turn[:, 0].mT).max() < 0.1
     assert roma.rotmat_geodesic_distance(other, leading[:, 0].mT).max() < 0.1
     # It is kept with the weights.
@@ -117,8 +117,8 @@ def test_clouds_do_not_interact_and_the_gallery_is_saved(learnt):
     again.load_state_dict(learnt.state_dict())
     assert again.learnt
     for together, alone in zip(
-        learnt.search(CHAIN, data.points, data.points)[1:4],
-        again.search(CHAIN, data.points[1:2], data.points[1:2])[1:4],
+        learnt.search(CHAIN, data.points)[1:4],
+        again.search(CHAIN, data.points[1:2])[1:4],
         strict=True,
     ):
         torch.testing.assert_close(together[1:2], alone, atol=1e-4, rtol=0)
@@ -197,9 +197,9 @@ def labelled(learnt):
 
 def test_labelled_clouds_say_parts_and_where_they_are(labelled):
     data = _chests(4, seed=1)
-    _, base, state, _, votes = labelled.search(CHAIN, data.points, data.points[:, :100])
-    assert votes.shape == (4, 100, 3)
-    assert (votes.argmax(dim=-1) == data.part[:100]).float().mean() > 0.85
+    _, base, state, _, votes = labelled.search(CHAIN, data.points)
+    assert torch.equal(votes.points, data.points) and votes.share.shape == (4, 2048, 3)
+    assert (votes.share.argmax(dim=-1) == data.part).float().mean() > 0.85
     assert roma.rotmat_geodesic_distance(base[:, 0, :3, :3], data.base[:, :3, :3]).rad2deg().max() < 5
     assert (state[:, 0] - data.state).abs().median() < 0.02
 
@@ -219,10 +219,10 @@ def test_labels_are_saved_and_decide_which_part_points_are_of(labelled):
     for search in (labelled, swapped):
         estimator.sliding.load_state_dict(search.state_dict())
         with torch.inference_mode():  # as a trainer tests
-            parts.append(estimator.predict(points.clone(), 256, dense=data.points.clone()).part_id)
-    assert (parts[0] == data.part[:256]).float().mean() > 0.85
-    other = torch.tensor([0, 2, 1])[parts[1]]
-    assert (other == data.part[:256]).float().mean() > 0.85
+            parts.append(estimator.predict(points.clone(), 256, dense=data.points.clone()))
+    for one, name in zip(parts, ([0, 1, 2], [0, 2, 1]), strict=True):
+        for own, true in ((one.part_id, data.part[:256]), (one.dense_part_id, data.part)):
+            assert own.shape[1] == len(true) and (torch.tensor(name)[own] == true).float().mean() > 0.85
 
 
 def test_votes_follow_faces_and_points_have_those_of_the_nearest(labelled, monkeypatch):
@@ -236,7 +236,7 @@ def test_votes_follow_faces_and_points_have_those_of_the_nearest(labelled, monke
     monkeypatch.setattr(LabelledClouds, "votes", votes)
     said = (votes(None, None, 3, data.points).argmax(dim=-1) == data.part).float().mean()
     nearly = data.points[:, 5:105] + 1e-5
-    found = labelled.search(CHAIN, data.points, nearly).votes.argmax(dim=-1)
+    found = labelled.search(CHAIN, data.points).votes.at(nearly).argmax(dim=-1)
     assert (found == data.part[5:105]).float().mean() > said + 0.05
 
 

@@ -57,8 +57,8 @@ def test_unseen_views_are_found_and_rivals_are_turned_another_way(learnt):
     back = transform_points(torch.linalg.inv(base[:, 0]), data.points)
     truth = transform_points(torch.linalg.inv(data.base), data.points)
     assert (back - truth).norm(dim=-1).mean() < 0.1
-    torch.testing.assert_close(votes.sum(dim=-1), torch.ones(6, 512))
-    assert (votes.argmax(dim=-1) == data.part).float().mean() > 0.95
+    torch.testing.assert_close(votes.share.sum(dim=-1), torch.ones(6, 512))
+    assert (votes.share.argmax(dim=-1) == data.part).float().mean() > 0.95
     unsure = margin < 1
     apart = _degrees(base[:, 0, :3, :3], base[:, 1, :3, :3])
     assert (apart[unsure] > 30).all() and (apart[~unsure] < 1e-2).all()
@@ -80,8 +80,9 @@ def test_views_do_not_interact_and_what_was_learnt_is_saved(learnt):
     read = {name: value.float() if value.is_floating_point() else value for name, value in learnt.state_dict().items()}
     again.load_state_dict(read)
     assert again.learnt and again.views.dtype == torch.int8
-    for together, alone in zip(learnt.search(data.points), again.search(data.points[1:2]), strict=True):
-        torch.testing.assert_close(together[1:2], alone, atol=1e-5, rtol=0)
+    together, alone = learnt.search(data.points), again.search(data.points[1:2])
+    for one, other in zip((*together[:3], *together.votes), (*alone[:3], *alone.votes), strict=True):
+        torch.testing.assert_close(one[1:2], other, atol=1e-5, rtol=0)
 
 
 def test_weights_from_before_there_was_a_search_have_none():
@@ -94,7 +95,7 @@ def test_few_views_of_few_points_will_do():
     data = _views(5, seed=4)
     search = _learnt(data._replace(points=data.points[:, :100]))
     seen = search.search(data.points[:2, :90])
-    assert all(value.isfinite().all() for value in seen) and seen.votes.shape == (2, 90, 2)
+    assert all(value.isfinite().all() for value in (*seen[:3], *seen.votes)) and seen.votes.share.shape == (2, 90, 2)
 
 
 @pytest.fixture(scope="module")
@@ -124,11 +125,14 @@ def test_the_search_decides_and_hypotheses_turned_alike_compete(learnt, estimato
     estimator.view_search.load_state_dict(learnt.state_dict())
     with torch.inference_mode():  # as a trainer tests
         found, rival = estimator.predict_with_rivals(points.clone(), 256)
-    for prediction in (found, estimator.search(points, torch.zeros(1, 2))):
+    for prediction in (found, estimator.search(points, data.points)):
         assert _degrees(prediction.base_pose[:, :3, :3], truth).max() < 20
         assert (prediction.joint_state - data.state).abs().median() < 0.3
         assert (prediction.part_id == data.part[:256]).float().mean() > 0.9
         torch.testing.assert_close(prediction.part_probability.sum(dim=-1), torch.ones(3, 256))
+    assert found.dense_part_id.shape == (3, 0)  # no more points were given
+    every = estimator.search(points, data.points).dense_part_id
+    assert every.shape == data.points.shape[:2] and (every == data.part).float().mean() > 0.9
     unsure = found.margin < 1
     assert (_degrees(found.base_pose[:, :3, :3], rival.base_pose[:, :3, :3])[unsure] > 20).all()
     # Without registration the network answers alone.

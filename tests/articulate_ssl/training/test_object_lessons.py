@@ -9,6 +9,8 @@ from articulate_ssl.discovery.similar_clouds import LabelledClouds
 from articulate_ssl.training.object_lessons import learn_objects
 
 # Nine clouds of object 5, three of object 6, eight of objects 2 and 4.
+STACK = ((0.0, 0.4, 0.3), (0.0, 0.1, 0.3), (0.0, -0.3, 0.3))  # z points to the front
+ROW = ((-0.5, 0.3, 0.3), (0.0, 0.3, 0.3), (0.5, 0.3, 0.3))
 INSTANCE = torch.tensor([5, 2, 4] * 8 + [5, 6, 6, 6])
 
 
@@ -21,7 +23,7 @@ def module(monkeypatch):
         assert chain == module.articulated.category.chain() and len(clouds) == 8
         if (clouds == 4).all():
             raise DiscoveryError("not this one")
-        return LabelledClouds(clouds, clouds[..., 0].long() % 2)
+        return LabelledClouds(clouds, (torch.arange(POINTS) % 2).expand(8, POINTS))
 
     monkeypatch.setattr(module.sliding, "understood", understood)
     return module
@@ -38,8 +40,29 @@ def test_clouds_of_what_is_understood_take_the_place_of_fewer(module, caplog):
     sliding = module.sliding
     kept = sliding.labelled.float() * sliding.step[:, None, None]
     assert sorted(kept[:, 0, 0].round().int().tolist()) == [2] * 8 + [5] * 8
-    assert torch.equal(sliding.part[:, 0].float(), kept[:, 0, 0].round() % 2)
+    assert (sliding.part.long() == torch.arange(POINTS) % 2).all()
     assert "parts of 2 of 3 objects are understood" in caplog.text and "not this one" in caplog.text
+
+
+def test_parts_of_rare_kinds_are_called_as_in_others(monkeypatch):
+    """Of a desk among chests, whose drawers the others called in another order."""
+    module = tiny_module(joint_type="prismatic", num_parts=4).eval()
+    label = (torch.arange(POINTS) % 4).expand(8, POINTS)
+    stack, row = (torch.tensor([[0.0, 0, 0], *places]) for places in (STACK, ROW))
+    odd = torch.tensor([0, 2, 3, 1])
+    monkeypatch.setattr(
+        module.sliding,
+        "understood",
+        lambda chain, clouds: (
+            LabelledClouds(row[odd][label], label) if (clouds == 4).all() else LabelledClouds(stack[label], label)
+        ),
+    )
+    learn_objects(module, _clouds(), INSTANCE)
+    sliding = module.sliding
+    desk = sliding.labelled[:, :, 0].float().std(dim=1) > 0
+    assert int(desk.sum()) == 8 and torch.equal(sliding.part[~desk].long(), label.repeat(2, 1))
+    told = sliding.part[desk].long()
+    assert torch.equal(told, odd[label]) or torch.equal(told, torch.tensor([0, 3, 2, 1])[odd][label])
 
 
 def test_what_there_is_stays_where_no_more_is_understood(module):
