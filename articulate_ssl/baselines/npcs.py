@@ -244,14 +244,16 @@ class NPCS(Method):
 
     @torch.no_grad()
     def predict(self, batch: dict[str, Tensor]) -> Prediction:
-        """Reads `points` and `dense_points`."""
-        points = batch["points"]
-        geometry = SurfaceCloud.of(points, *spin_images(points[:, : self.size.read], batch["dense_points"]), self.size)
-        frame, margin = self.choose_frames(geometry)
-        seen = geometry.seen_in(frame[:, None])
+        """Reads `points` and `dense_points`, which these lead; labels all."""
+        points, dense = batch["points"], batch["dense_points"]
+        surface = spin_images(points[:, : self.size.read], dense)
+        frame, margin = self.choose_frames(SurfaceCloud.of(points, *surface, self.size))
+        seen = SurfaceCloud.of(dense, *surface, self.size).seen_in(frame[:, None])
         said = self.network.look(seen)
         logits, coordinates = self.network.coordinates(seen, said)
-        return self.assemble(points, logits, coordinates, said, margin)
+        own = slice(points.shape[1])
+        found = self.assemble(points, logits[:, own], coordinates[:, :, own], said, margin)
+        return replace(found, dense_part_id=logits.argmax(-1))
 
     def choose_frames(self, geometry: SurfaceCloud) -> tuple[Tensor, Tensor]:  # [B, 3, 3], [B]
         """The frame in which every cloud is read, and how much better it is than the next that is turned another way.

@@ -150,6 +150,20 @@ def swap_slots(prediction: Prediction, clouds: torch.Tensor) -> Prediction:
     )
 
 
+def test_points_count_as_they_are_labelled_or_as_the_nearest_is():
+    labels = articulated_labels(clouds=6, num_parts=2)
+    truth = perfect_oracle(labels)
+    right = labels["dense_part_id"].long()
+    exchanged = [1 - right, torch.where(torch.arange(right.shape[1]) % 2 == 0, right, 1 - right)]
+    by_nearest = score(truth, labels, truth, labels)["seg_miou"]["mean"]
+    found = [
+        score(replace(truth, dense_part_id=d), labels, truth, labels)["seg_miou"]["mean"] for d in (right, *exchanged)
+    ]
+    assert found[0] == 1 >= by_nearest and found[1] == 0 and 0.2 < found[2] < 0.5
+    with pytest.raises(ValueError, match="dense_points"):
+        score(replace(truth, dense_part_id=right[:, 1:]), labels, truth, labels)
+
+
 def test_exchanged_parts_are_punished_and_only_legacy_columns_forgive():
     labels = articulated_labels(clouds=20, num_parts=2)
     truth = perfect_oracle(labels)
