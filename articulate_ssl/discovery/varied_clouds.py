@@ -49,11 +49,20 @@ def varied(
     generator: torch.Generator,
 ) -> LabelledClouds:
     """The clouds themselves, then copies of all in other proportions whose parts have slid, in unit boxes again."""
-    slide = joints.axis.new_zeros(len(joints.axis) + 1, 3).index_copy(0, torch.tensor(joints.chain.child), joints.axis)
     part, found = labelled.part.long(), [labelled.points]
     copies = min(max(_CLOUDS // len(part), _FEWEST_COPIES), _MOST_COPIES)
-    for _ in range(copies):
-        moved = _SLIDE * torch.randn(len(part), len(slide), generator=generator).to(slide)  # [n, K]
-        shift = (moved[..., None] * slide).gather(1, part[..., None].expand(-1, -1, 3))
-        found.append(unit_boxes(_stretched(labelled.points, generator) + shift)[0])
+    found += [in_other_states(labelled, joints, generator) for _ in range(copies)]
     return LabelledClouds(torch.cat(found), labelled.part.repeat(copies + 1, 1))
+
+
+def in_other_states(
+    labelled: LabelledClouds,
+    joints: Joints,  # of their parts
+    generator: torch.Generator,
+) -> Tensor:  # [r, P, 3]
+    """A copy of every cloud in other proportions, whose parts have slid, in unit boxes."""
+    part = labelled.part.long()
+    slide = joints.axis.new_zeros(len(joints.axis) + 1, 3).index_copy(0, torch.tensor(joints.chain.child), joints.axis)
+    moved = _SLIDE * torch.randn(len(part), len(slide), generator=generator).to(slide)  # [n, K]
+    shift = (moved[..., None] * slide).gather(1, part[..., None].expand(-1, -1, 3))
+    return unit_boxes(_stretched(labelled.points, generator) + shift)[0]

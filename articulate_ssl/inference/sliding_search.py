@@ -6,8 +6,8 @@ a new cloud is turned as it is most like some clouds of those chests, or copies 
 stretched to one box. That decides: a shape that is placed in the cloud, and stretched, fits about as well upside down.
 It also teaches a network that sees the surface (`training.turn_lessons`), which then chooses among the likeliest turns.
 Where whole objects were discovered, clouds of theirs that are most like the new one, or copies in other proportions and
-joint states, say which part its points are of, and the shape's parts fill their boxes; else parts are placed by what
-every offset costs.
+joint states, say which part its points are of, or a network that they taught, which knows it better (`part_network`),
+and the shape's parts fill their boxes; else parts are placed by what every offset costs.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.screw import PRISMATIC
 from articulate_ssl.geometry.se3 import se3
+from articulate_ssl.inference.part_network import PartNetwork
 from articulate_ssl.inference.surface_decision import WithSurface
 from articulate_ssl.inference.votes import Votes
 from articulate_ssl.ops.few_bytes import from_few_bytes, in_few_bytes
@@ -83,11 +84,13 @@ class SlidingSearch(WithSurface):
         points: [K, M, 3] the shape in canonical object space, whose axes are the clouds' common frame.
         axis, pivot: [J, 3] its joints; limits: [J, 2] of their states.
         surface: Which of the leading turns looks right, if that was taught.
+        parts: Which part points are of, if that was taught; else labelled clouds say it.
     """
 
     def __init__(self, num_parts: int, shape_points: int) -> None:
         super().__init__()
         joints = num_parts - 1
+        self.register_module("parts", None)
         self._copies: tuple[Tensor | None, LabelledClouds | None] = None, None  # of the clouds `labelled`
         self.register_buffer("gallery", torch.zeros(0, _GALLERY_POINTS, 3))
         self.register_buffer("labelled", torch.zeros(0, _LABELLED_POINTS, 3, dtype=torch.int8))
@@ -194,7 +197,8 @@ class SlidingSearch(WithSurface):
         device, clouds = clouds.device, clouds.cpu().clone()  # no inference tensor
         turn, margin = self.turns(clouds, decides)
         copies = torch.einsum("bcij,bnj->bcni", turn, clouds).flatten(0, 1)
-        fit, share = self._fitted(self._shape(chain), copies)
+        said = None if self.parts is None else self._said(clouds, turn).flatten(0, 1)
+        fit, share = self._fitted(self._shape(chain), copies, said)
         back = se3(turn.mT, turn.new_zeros(*turn.shape[:2], 3))
         base, state = (value.unflatten(0, turn.shape[:2]).to(device) for value in (fit.base, fit.state))
         found = fit.instances()
@@ -204,28 +208,37 @@ class SlidingSearch(WithSurface):
         votes = None if share is None else Votes(clouds.to(device), share.to(device))
         return Slid(found, back.to(device) @ base, state, margin.to(device), votes)
 
+    def _said(self, clouds: Tensor, turn: Tensor) -> Tensor:  # [B, 2, N, K]
+        """By the network, which part points are of in each of two turns."""
+        where = self.points.device
+        return self.parts.probability(clouds.to(where), turn.to(where)).cpu()
+
     def _fitted(
         self,
         shape: ArticulatedShape,
         clouds: Tensor,  # [2 B, N, 3] turned
-    ) -> tuple[InstanceFit, Tensor | None]:  # , [B, M, K]
+        said: Tensor | None,  # [2 B, N, K] which parts points are of
+    ) -> tuple[InstanceFit, Tensor | None]:  # , [B, N, K]
         """The shape in the clouds, and which parts points are of in the likelier turn, if others say it."""
         if not len(self.labelled):
             axes = torch.eye(3).to(clouds).expand(len(self.points), 3, 3)
             generator, few = torch.Generator().manual_seed(0), clouds[:, :_FITTED_POINTS].contiguous()
             return fit_slides(shape, axes, few, _PLACED_POINTS, _CYCLES, generator), None
-        boxes = unit_boxes(clouds)[0]
-        votes = self._varied(shape.joints).votes(boxes[:, :ASKING], shape.num_parts, boxes)
-        votes = torch.stack([_along_faces(*some) for some in zip(clouds, votes, strict=True)])
-        return fit_part_boxes(shape, clouds, votes.argmax(dim=-1)), votes[::_TURNS]
+        if said is None:
+            boxes = unit_boxes(clouds)[0]
+            said = self._varied(shape.joints).votes(boxes[:, :ASKING], shape.num_parts, boxes)
+        said = torch.stack([_along_faces(*some) for some in zip(clouds, said, strict=True)])
+        return fit_part_boxes(shape, clouds, said.argmax(dim=-1)), said[::_TURNS]
 
     @torch.no_grad()
     def understood(
         self,
         chain: KinematicChain,
         clouds: Tensor,  # [n, N, 3] of one object
-    ) -> LabelledClouds:
+    ) -> tuple[LabelledClouds, Tensor]:  # , [n, 3, 3]
         """What may be kept of the object beside clouds whose points have parts, by these and by how it moves.
+
+        And cloud -> the frame in which it stands as the collection does.
 
         Raises:
             DiscoveryError: if that does not explain it.
@@ -234,9 +247,13 @@ class SlidingSearch(WithSurface):
         turn, _ = self.leading_turns(clouds)
         if self.surface is not None:
             turn, _ = self._looked_at(turn, clouds)
-        joints = self._shape(chain).joints
+        joints = self.joints(chain)
         found, turn = find_as_others(clouds, turn, self._varied(joints), joints)
-        return LabelledClouds(unit_boxes(clouds @ turn.mT)[0][:, : found.label.shape[1]], found.label)
+        return LabelledClouds(unit_boxes(clouds @ turn.mT)[0][:, : found.label.shape[1]], found.label), turn
+
+    def joints(self, chain: KinematicChain) -> Joints:
+        """Of the shape, on the CPU."""
+        return self._shape(chain).joints
 
     def _varied(self, joints: Joints) -> LabelledClouds:
         """The labelled clouds and copies of them, made when they are first asked for."""
@@ -257,6 +274,8 @@ class SlidingSearch(WithSurface):
         for name, own in list(self.named_buffers(recurse=False)):
             value = state_dict.setdefault(prefix + name, own.clone())
             setattr(self, name, torch.empty_like(value, dtype=own.dtype, device=own.device))
+        taught = any(name.startswith(f"{prefix}parts.") for name in state_dict)
+        self.parts = PartNetwork(len(self.points)).to(self.points).requires_grad_(False) if taught else None
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
 

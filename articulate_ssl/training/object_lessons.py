@@ -4,7 +4,8 @@ No label is read, but which clouds show the same object is known, as where disco
 clouds (`discovery.grouped`). What these say of other objects is confirmed by how each of those moves
 (`discovery.one_object.as_others`), in a third of the time that discovery takes. An object that discovery found itself
 is asked about again, and its own clouds are among those that answer. In the end all are named alike: names that the
-few gave to kinds of objects that were rare among them may be as they came.
+few gave to kinds of objects that were rare among them may be as they came. And they teach a network that says which
+part points of other objects are of (`part_lessons`).
 """
 
 from __future__ import annotations
@@ -24,9 +25,12 @@ from articulate_ssl.discovery.references import evenly_chosen
 from articulate_ssl.discovery.similar_clouds import LabelledClouds
 from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.ops.progress import announced, tell
+from articulate_ssl.training.part_lessons import teach_parts
 
 if TYPE_CHECKING:
     from articulate_ssl.training.module import ArticulatedPoseModule
+
+_ENOUGH = 0.9  # as many clouds as there were, of which a few objects may not be understood again. Chosen.
 
 log = logging.getLogger(__name__)
 
@@ -37,19 +41,25 @@ def learn_objects(
     clouds: Tensor,  # [n, N, 3] farthest-point order, dense
     instance: Tensor,  # [n] which object each shows
 ) -> None:
-    """Keep the clouds of every object that is understood, if that are more than there were."""
+    """Keep the clouds of every object that is understood, if that are as many as there were, and teach a network."""
     sliding, chain = module.estimator.sliding, module.articulated.category.chain()
     rows = [(instance == one).nonzero()[:, 0] for one in instance.unique()]
     rows = [evenly_chosen(own, MIN_CLOUDS) for own in rows if len(own) >= MIN_CLOUDS]
-    found = []
+    found, standing = [], []
     for own in announced(log, "parts of more objects", rows):
         try:
-            found.append(sliding.understood(chain, clouds[own]))
+            labelled, turn = sliding.understood(chain, clouds[own])
         except DiscoveryError as error:
             log.info("an object is left out: %s", error)
+            continue
+        found.append(labelled)
+        standing.append(clouds[own].cpu() @ turn.mT)
     tell(log, "parts of %d of %d objects are understood", len(found), len(rows))
-    if sum(len(one.part) for one in found) > len(sliding.labelled):
-        sliding.learn_labelled(_named_alike(found, chain))
+    if not found or sum(len(one.part) for one in found) < _ENOUGH * len(sliding.labelled):
+        return
+    named = _named_alike(found, chain)
+    sliding.learn_labelled(named)
+    sliding.parts = teach_parts(torch.cat(standing), named.part, sliding.joints(chain)).to(sliding.points.device)
 
 
 def _named_alike(found: Sequence[LabelledClouds], chain: KinematicChain) -> LabelledClouds:

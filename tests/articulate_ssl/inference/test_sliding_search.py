@@ -4,6 +4,7 @@ import pytest
 import roma
 import torch
 from articulated_objects import CHEST, Clouds, clouds
+from torch.nn.functional import one_hot
 
 from articulate_ssl.discovery.registration import chamfer_l1
 from articulate_ssl.discovery.similar_clouds import LabelledClouds
@@ -12,6 +13,7 @@ from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.geometry.screw import PRISMATIC
 from articulate_ssl.geometry.se3 import se3, transform_points
 from articulate_ssl.inference.options import InferenceOptions
+from articulate_ssl.inference.part_network import PartNetwork
 from articulate_ssl.inference.pose_estimation import PoseEstimator
 from articulate_ssl.inference.scan_scales import predict_scans
 from articulate_ssl.inference.sliding_search import SlidingSearch
@@ -228,7 +230,7 @@ def test_labels_are_saved_and_decide_which_part_points_are_of(labelled):
 def test_votes_follow_faces_and_points_have_those_of_the_nearest(labelled, monkeypatch):
     data = _chests(2, seed=6)
     noise = torch.rand(4, 2048, 3, generator=torch.Generator().manual_seed(0))
-    clean = torch.nn.functional.one_hot(data.part, 3).float()
+    clean = one_hot(data.part, 3).float()
 
     def votes(self, boxes, num_parts, points):
         return (0.6 * clean + noise).clamp(max=1.2)[:, : points.shape[1]] / 3
@@ -240,9 +242,35 @@ def test_votes_follow_faces_and_points_have_those_of_the_nearest(labelled, monke
     assert (found == data.part[5:105]).float().mean() > said + 0.05
 
 
+def test_a_network_says_parts_in_place_of_labelled_clouds(labelled, monkeypatch):
+    """Of either turn; and it is saved."""
+    data, taught = _chests(2, seed=8), SlidingSearch(3, 200)
+    taught.load_state_dict(labelled.state_dict())
+    assert taught.parts is None
+    taught.parts = PartNetwork(3).eval().requires_grad_(False)
+    again = SlidingSearch(3, 200)
+    again.load_state_dict(taught.state_dict())
+    assert again.parts is not None and not any(p.requires_grad for p in again.parameters())
+    asked = []
+
+    def probability(clouds, turn):
+        asked.append(turn)
+        likelier = one_hot(data.part, 3).float()
+        return torch.stack([likelier, likelier.roll(1, dims=-1)], dim=0).expand(len(clouds), -1, -1, -1)
+
+    monkeypatch.setattr(again.parts, "probability", probability)
+    monkeypatch.setattr(LabelledClouds, "votes", None)  # nobody asks
+    found = again.search(CHAIN, data.points)
+    assert asked[0].shape == (2, 2, 3, 3)
+    assert (found.votes.share.argmax(dim=-1) == data.part).float().mean() > 0.97
+    assert (found.state[:, 0] - data.state).abs().median() < 0.02
+
+
 def test_an_object_is_understood_and_may_be_kept(labelled):
     data = _chests(8, seed=7)
-    understood = labelled.understood(CHAIN, data.points)
+    understood, turn = labelled.understood(CHAIN, data.points)
+    truth = data.base[:, :3, :3].mT
+    assert roma.rotmat_geodesic_distance(turn, truth).rad2deg().max() < 5
     assert understood.points.shape == (8, 2048, 3) and (understood.part == data.part).float().mean() > 0.97
     standing, _, _ = unit_boxes(transform_points(torch.linalg.inv(data.base), data.points))
     assert (understood.points - standing).abs().max() < 0.2

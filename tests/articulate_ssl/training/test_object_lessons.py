@@ -6,6 +6,7 @@ from tiny import POINTS, tiny_module
 
 from articulate_ssl.discovery.discover import DiscoveryError
 from articulate_ssl.discovery.similar_clouds import LabelledClouds
+from articulate_ssl.training import part_lessons
 from articulate_ssl.training.object_lessons import learn_objects
 
 # Nine clouds of object 5, three of object 6, eight of objects 2 and 4.
@@ -23,9 +24,10 @@ def module(monkeypatch):
         assert chain == module.articulated.category.chain() and len(clouds) == 8
         if (clouds == 4).all():
             raise DiscoveryError("not this one")
-        return LabelledClouds(clouds, (torch.arange(POINTS) % 2).expand(8, POINTS))
+        return LabelledClouds(clouds, (torch.arange(POINTS) % 2).expand(8, POINTS)), torch.eye(3).expand(8, 3, 3)
 
     monkeypatch.setattr(module.sliding, "understood", understood)
+    monkeypatch.setattr(part_lessons, "_STEPS", 2)
     return module
 
 
@@ -41,12 +43,14 @@ def test_clouds_of_what_is_understood_take_the_place_of_fewer(module, caplog):
     kept = sliding.labelled.float() * sliding.step[:, None, None]
     assert sorted(kept[:, 0, 0].round().int().tolist()) == [2] * 8 + [5] * 8
     assert (sliding.part.long() == torch.arange(POINTS) % 2).all()
+    assert sliding.parts.num_parts == 2 and not any(p.requires_grad for p in sliding.parts.parameters())
     assert "parts of 2 of 3 objects are understood" in caplog.text and "not this one" in caplog.text
 
 
 def test_parts_of_rare_kinds_are_called_as_in_others(monkeypatch):
     """Of a desk among chests, whose drawers the others called in another order."""
     module = tiny_module(joint_type="prismatic", num_parts=4).eval()
+    monkeypatch.setattr(part_lessons, "_STEPS", 2)
     label = (torch.arange(POINTS) % 4).expand(8, POINTS)
     stack, row = (torch.tensor([[0.0, 0, 0], *places]) for places in (STACK, ROW))
     odd = torch.tensor([0, 2, 3, 1])
@@ -54,7 +58,8 @@ def test_parts_of_rare_kinds_are_called_as_in_others(monkeypatch):
         module.sliding,
         "understood",
         lambda chain, clouds: (
-            LabelledClouds(row[odd][label], label) if (clouds == 4).all() else LabelledClouds(stack[label], label)
+            LabelledClouds(row[odd][label] if (clouds == 4).all() else stack[label], label),
+            torch.eye(3).expand(8, 3, 3),
         ),
     )
     learn_objects(module, _clouds(), INSTANCE)
@@ -66,10 +71,10 @@ def test_parts_of_rare_kinds_are_called_as_in_others(monkeypatch):
 
 
 def test_what_there_is_stays_where_no_more_is_understood(module):
-    module.sliding.learn_labelled(LabelledClouds(torch.rand(16, POINTS, 3), torch.zeros(16, POINTS)))
+    module.sliding.learn_labelled(LabelledClouds(torch.rand(18, POINTS, 3), torch.zeros(18, POINTS)))
     before = module.sliding.labelled.clone()
     learn_objects(module, _clouds(), INSTANCE)
-    assert torch.equal(module.sliding.labelled, before)
+    assert torch.equal(module.sliding.labelled, before) and module.sliding.parts is None
 
 
 def test_whole_objects_are_asked_for_where_discovery_found_some(module, monkeypatch):
