@@ -49,7 +49,9 @@ _TURNS = 2  # the likeliest, and its rival
 _LEADING = 4  # turns among which a network chooses, if one was taught
 _FITTED_POINTS = 1024  # of a cloud, to which the shape is fitted
 _PLACED_POINTS = 256  # of the shape, whose offsets are tried
-_SPREAD = 30.0  # how far votes spread along faces: of 80 clouds, 10 to 100 were alike (step 173)
+# How far what is said spreads along faces: of 80 clouds, 10 to 100 were alike of votes (step 173); it takes a network's
+# mIoU from .914 to .922 (step 179).
+_SPREAD = 30.0
 _CYCLES = 4  # of the descent on every candidate; twice as many on the best
 
 
