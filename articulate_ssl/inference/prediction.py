@@ -94,11 +94,11 @@ class ScanEstimate:
         prediction: B = 1, normalised units.
         rival: The best hypothesis that is turned another way, B = 1; None if none was considered.
         points: [N, 3] the normalised points that both label.
-        dense: [P, 3] those that `Prediction.dense_part_id` is of.
         center: [3], in the frame of the scan.
         scale: Units of the scan per normalised unit.
         probability: That orientation and parts are right; None if that has not been learnt (`inference.confidence`).
         unlike: Share of the training clouds that were explained better; None likewise.
+        dense: [P, 3] normalised points that `Prediction.dense_part_id` is of; None if that has none.
     """
 
     prediction: Prediction
@@ -106,6 +106,6 @@ class ScanEstimate:
     points: np.ndarray
     center: np.ndarray
     scale: float
-    dense: np.ndarray | None = None
     probability: float | None = None
     unlike: float | None = None
+    dense: np.ndarray | None = None

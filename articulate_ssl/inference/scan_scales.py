@@ -80,7 +80,7 @@ def _predict_together(
             dense = dense[own]
         every = dense[0].cpu().numpy() if one.dense_part_id.shape[1] else None
         other = other if one.margin < 1 else None
-        estimates.append(ScanEstimate(one, other, some[0].cpu().numpy(), center, scale[best], every))
+        estimates.append(ScanEstimate(one, other, some[0].cpu().numpy(), center, scale[best], dense=every))
     return estimates
 
 

@@ -134,7 +134,7 @@ def test_what_slides_or_takes_no_proportions_stays_as_it_is(final, data):
 def test_objects_in_turned_frames_are_hinged_as_most_are_if_that_fits_better(monkeypatch):
     estimator = tiny_module(inference=InferenceOptions(refine=True)).eval().estimator
     points = torch.rand(4, POINTS, 3, generator=torch.Generator().manual_seed(0))
-    predicted = estimator.predict(points, POINTS)
+    predicted = estimator.predict(points, POINTS, dense=points)
     monkeypatch.setattr(estimator.registration, "freed", lambda one, _points: one)
     monkeypatch.setattr(estimator.final, "in_proportion", lambda one, *_: one)
     # Of what was not turned nothing is asked; of the others the one that fits worse gives way.
