@@ -85,10 +85,8 @@ class CoordinateNetwork(SurfaceNetwork):
         by rotations: it corrects what the whole shape says.
         """
         B, N, _ = seen.points.shape
-        index = seen.near.flatten(1)[..., None].expand(-1, -1, said.local.shape[-1])
-        carried = (said.local.gather(1, index).unflatten(1, (N, -1)) * seen.near_weight[..., None]).sum(2)
         whole = said.whole[:, None].expand(-1, N, -1)
-        out = self.part_and_coordinates(self.point(torch.cat([carried, seen.points, whole], dim=-1)))
+        out = self.part_and_coordinates(self.point(torch.cat([seen.carried(said.local), seen.points, whole], dim=-1)))
         logits, correction = out.split([self.num_parts, 3 * self.num_parts], dim=-1)
         turned = torch.einsum("bni,bkij->bknj", seen.points, said.rotation)
         return logits, turned + said.shift[:, :, None] + correction.view(B, N, -1, 3).transpose(1, 2)

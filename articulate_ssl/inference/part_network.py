@@ -39,10 +39,8 @@ class PartNetwork(SurfaceNetwork):
         read = slice(self.size.read)
         cloud = SurfaceCloud.of(boxes, images[:, read], normal[:, read], self.size)
         local, whole = self.describe(cloud)
-        index = cloud.near.flatten(1)[..., None].expand(-1, -1, local.shape[-1])
-        carried = (local.gather(1, index).unflatten(1, cloud.near.shape[1:]) * cloud.near_weight[..., None]).sum(2)
         whole = whole[:, None].expand(-1, boxes.shape[1], -1)
-        return self.point(torch.cat([carried, whole, cloud.points, images, normal], dim=-1))
+        return self.point(torch.cat([cloud.carried(local), whole, cloud.points, images, normal], dim=-1))
 
     @torch.no_grad()
     def probability(

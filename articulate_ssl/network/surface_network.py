@@ -93,6 +93,14 @@ class SurfaceCloud(NamedTuple):
         points, normal = (torch.einsum("bni,bsij->bsnj", x, frame).flatten(0, 1) for x in self[:2])
         return SurfaceCloud(points, normal, *(x.repeat_interleave(copies, dim=0) for x in self[2:]))
 
+    def carried(
+        self,
+        local: Tensor,  # [B, M', C] of the points that are left
+    ) -> Tensor:  # [B, N, C]
+        """What every point takes from the nearest of them."""
+        index = self.near.flatten(1)[..., None].expand(-1, -1, local.shape[-1])
+        return (local.gather(1, index).unflatten(1, self.near.shape[1:]) * self.near_weight[..., None]).sum(2)
+
     def rows(self, key) -> SurfaceCloud:
         """Some of the clouds."""
         return SurfaceCloud(*(x[key] for x in self))

@@ -62,6 +62,10 @@ def _no_network_of_turns(estimator: PoseEstimator) -> None:
     estimator.sliding.surface = None
 
 
+def _no_network_of_parts(estimator: PoseEstimator) -> None:
+    estimator.sliding.parts = None
+
+
 ABLATIONS = (
     Ablation(NOTHING, lambda _: True, lambda _: None),
     Ablation(
@@ -72,6 +76,9 @@ ABLATIONS = (
     Ablation("relief and that network", lambda of: bool(of.two_ways.learnt), _no_decision),
     Ablation(
         "the network that chooses among leading turns", lambda of: of.sliding.surface is not None, _no_network_of_turns
+    ),
+    Ablation(
+        "the network that says parts, by votes instead", lambda of: of.sliding.parts is not None, _no_network_of_parts
     ),
     Ablation("the search in the collection", lambda of: of.sliding.learnt, lambda of: of.sliding.forget()),
     Ablation("the search among simulated views", lambda of: of.view_search.learnt, lambda of: of.view_search.forget()),

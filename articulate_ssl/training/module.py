@@ -93,7 +93,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             turns that a collection says (`inference.sliding_search`); 0 learns none.
         object_samples: Training clouds of whole objects, each from all its clouds, whose parts are found where some
             objects' were, as those have them and as they move (`discovery.one_object.as_others`): where parts slide,
-            in the multi-state setting (`discovery.grouped`). Ten seconds an object; 0 finds none.
+            in the multi-state setting (`discovery.grouped`), and teach a network which part points are of
+            (`inference.part_network`). Ten seconds an object, and ten minutes; 0 finds none.
         handedness_samples: Training clouds of an upright camera from which it is learnt whether some objects are mirror
             images of the others (`inference.handedness`); 0 learns nothing of it.
         part_frames_samples: Training clouds from which it is learnt which parts have faces that say how they are
