@@ -47,7 +47,7 @@ class InstanceFit:
 
     Parts stretch along the principal axes they have in the template: the root about its centre, any other part about
     the pivot of its joint, which moves with the part it is on (`shape.stretch`). In a frame that clouds have in common,
-    where parts slide, they also lie elsewhere beside their slide: drawers of one chest are lower than those of another.
+    where parts slide, they also lie elsewhere: drawers of one chest are lower than those of another.
 
     Args:
         shape: Points and labels at joint state zero; states stay within the joints' limits if there are any. Joint
@@ -58,7 +58,8 @@ class InstanceFit:
         axes: [K, 3, 3] columns along which parts stretch instead; joint axes then stay as they are.
         faces: [K, 3, 3] columns along which parts stretch instead, and nothing else.
         log_stretch: [n, K, 3] start; none by default.
-        beside: [n, K, 3] start of where parts lie beside their slide, with `axes`; none by default.
+        beside: [n, K, 3] start of where else parts lie, with `axes`; none by default. Along a slide it stays as it is,
+            as how far a part has slid says the same.
     """
 
     def __init__(
@@ -85,6 +86,7 @@ class InstanceFit:
         self.axes, given = axes, faces if axes is None else axes
         self._principal = given is None
         self._axes = torch.eye(3).to(base).repeat(shape.num_parts, 1, 1) if given is None else given
+        self._children = list(shape.joints.chain.child)
         self._center = shape.points.mean(dim=0)
         self._slack: Tensor | None = None  # [n, 2 J] how far parts may be from the lines of joints that draw them
         self._measure_parts()
@@ -112,7 +114,7 @@ class InstanceFit:
 
     @property
     def beside(self) -> Tensor | None:
-        """[n, K, 3] where parts lie beside their slide, in template space; None where none may."""
+        """[n, K, 3] where else parts lie, in template space; None where they may not."""
         return None if self.axes is None else self._beside
 
     def rehinged(
@@ -170,6 +172,8 @@ class InstanceFit:
                 if known is not None:
                     self._turn.grad[known[0]] = 0
                     self._state.grad[known[1]] = 0
+                if self.axes is not None:
+                    self._beside.grad[:, self._children] -= self._along_slides(self._beside.grad[:, self._children])
                 optimizer.step()
                 self._state.data = self._shape.joints.clamped(self._state.data)
             if shared:
@@ -213,13 +217,19 @@ class InstanceFit:
         joints = self._joints()
         rest, pivots = hinged(stretch_matrices(self._axes, self.log_stretch), self._center, joints)
         if self.axes is not None:
-            children, slide = list(joints.chain.child), joints.axis
-            along = (self._beside[:, children] * slide).sum(dim=-1, keepdim=True)
-            beside = self._beside[:, children] - along * slide
-            pivots = pivots + beside
-            part = torch.eye(self._shape.num_parts).to(beside)[children]  # [J, K]
-            rest = replace(rest, shift=rest.shift + torch.einsum("jk,njd->nkd", part, beside))
+            pivots = pivots + self._beside[:, self._children]
+            moved = torch.ones(self._shape.num_parts, 1).to(self._beside)
+            moved[joints.chain.root] = 0
+            rest = replace(rest, shift=rest.shift + moved * self._beside)
         return rest, replace(joints, pivot=pivots)
+
+    def _along_slides(
+        self,
+        offset: Tensor,  # [n, J, 3]
+    ) -> Tensor:  # [n, J, 3]
+        """What of it is along the slides."""
+        slide = self._joints().axis
+        return (offset * slide).sum(dim=-1, keepdim=True) * slide
 
     def _joints(self) -> Joints:
         axis = functional.normalize(self._axis, dim=-1)

@@ -1,7 +1,11 @@
 """Where a shape's parts are in clouds whose points have parts: every part fills the box of its points.
 
 Parts that slide keep their orientation, so boxes along the axes of a common frame say all: how far a part is stretched,
-where it lies beside its slide, and how far it has slid. Nothing descends.
+how far it has slid, and where else it lies. Nothing descends.
+
+How far a part has slid is how far its middle is from the middle of the body, less than in the shape. Where the shape,
+once it is stretched, has its parts at rest says it less well: that depends on points about which they stretch, which
+nothing in a cloud says (docs/experiments.md, steps 181 and 183).
 """
 
 from __future__ import annotations
@@ -30,21 +34,22 @@ def fit_part_boxes(
     own_center = (own_low + own_high)[0] / 2
     ratio = torch.where(seen[..., None], (high - low).clamp(min=1e-6) / (own_high - own_low).clamp(min=1e-6), 1.0)
     still = torch.eye(4).to(clouds).expand(len(clouds), 4, 4)
-    state = clouds.new_zeros(len(clouds), len(shape.joints.chain.child))
+    root, children, axis = shape.joints.chain.root, list(shape.joints.chain.child), shape.joints.axis
     # Stretches are bounded; the places of parts follow from what is left of them.
-    log_stretch = InstanceFit(shape, still, state, generator, axes, ratio.log()).log_stretch
-    chain, root = shape.joints.chain, shape.joints.chain.root
+    start = clouds.new_zeros(len(clouds), len(children))
+    log_stretch = InstanceFit(shape, still, start, generator, axes, ratio.log()).log_stretch
     rest, _ = hinged(stretch_matrices(axes, log_stretch), shape.part(root).mean(dim=0), shape.joints)
     at_rest = torch.einsum("nkij,kj->nki", rest.linear, own_center) + rest.shift  # [n, K, 3]
-    moved = torch.where(seen[..., None], (low + high) / 2 - at_rest, 0.0)
-    shift = moved[:, root]
-    children, axis = list(chain.child), shape.joints.axis
-    beside = torch.where(seen[:, children, None], moved[:, children] - shift[:, None], 0.0)
-    along = (beside * axis).sum(dim=-1)
-    all_beside = clouds.new_zeros(len(clouds), shape.num_parts, 3)
-    all_beside[:, children] = beside - along[..., None] * axis
+    center = (low + high) / 2
+    shift = torch.where(seen[:, root, None], center[:, root] - at_rest[:, root], 0.0)
+    apart = (center - center[:, root, None]) - (own_center - own_center[root])
+    known = seen[:, children] & seen[:, root, None]
+    state = shape.joints.clamped(torch.where(known, (apart[:, children] * axis).sum(dim=-1), 0.0))
+    beside = torch.zeros_like(center)
+    beside[:, children] = (center - at_rest - shift[:, None])[:, children] - state[..., None] * axis
     base = se3(torch.eye(3).to(clouds).expand(len(clouds), 3, 3), shift)
-    return InstanceFit(shape, base, shape.joints.clamped(along), generator, axes, log_stretch, all_beside)
+    beside = torch.where(seen[..., None], beside, 0.0)
+    return InstanceFit(shape, base, state, generator, axes, log_stretch, beside)
 
 
 def part_boxes(

@@ -35,7 +35,7 @@ class RegisteredShape:
         error: [n] distance of every cloud to its reconstruction, stretched to its proportions (`InstanceFit.error`).
         axes: [K, 3, 3] columns along which parts stretch, where these are not their principal axes: the axes of the
             frame that clouds have in common.
-        beside: [n, K, 3] how far parts of each cloud lie beside their slide, in canonical object space, where they may.
+        beside: [n, K, 3] where else parts of each cloud lie, in canonical object space, where they may.
         point_part: [n, N] which part every point of the clouds belongs to, where more than the shape says it.
         labelled: What said it: clouds of whole objects, which stand as canonical object space does.
     """
@@ -69,9 +69,7 @@ class RegisteredShape:
 
     def limits(self) -> Tensor:
         """[J, 2] between which joint states lie, as far as the clouds show."""
-        limits = torch.quantile(self.state, torch.tensor(_LIMIT_QUANTILES).to(self.state), dim=0)
-        margin = _LIMIT_MARGIN * (limits[1] - limits[0])
-        return torch.stack([limits[0] - margin, limits[1] + margin], dim=-1)
+        return state_limits(self.state)
 
     def limited(self) -> ArticulatedShape:
         """The shape with these limits."""
@@ -101,6 +99,15 @@ class RegisteredShape:
         beside = None if self.beside is None else self.beside @ rotation.mT
         base = self.base @ invert_se3(turn)
         return replace(self, shape=self.shape.in_frame(turn), base=base, axes=axes, beside=beside, labelled=None)
+
+
+def state_limits(
+    state: Tensor,  # [n, J]
+) -> Tensor:  # [J, 2]
+    """Between which joint states lie, as far as n clouds show, of which some may be wrong."""
+    low, high = torch.quantile(state, torch.tensor(_LIMIT_QUANTILES).to(state), dim=0)
+    margin = _LIMIT_MARGIN * (high - low)
+    return torch.stack([low - margin, high + margin], dim=-1)
 
 
 def trimmed_mean(error: Tensor, options: DiscoveryOptions) -> float:

@@ -86,7 +86,7 @@ def simulate_views(
         state=state,
         log_stretch=stretch,
         error=found.error[sources] * scale,
-        beside=None if found.beside is None else mean * found.beside[sources],
+        beside=None if found.beside is None else scale[:, None, None] * found.beside[sources],
         point_part=torch.stack(parts),
     )
     return torch.from_numpy(np.stack(points)).to(clouds), registered

@@ -25,6 +25,7 @@ from articulate_ssl.discovery.one_object.as_others import find_as_others
 from articulate_ssl.discovery.one_object.moving_labels import spread_labels
 from articulate_ssl.discovery.one_object.surface import Surface
 from articulate_ssl.discovery.part_boxes import fit_part_boxes
+from articulate_ssl.discovery.registered_shape import state_limits
 from articulate_ssl.discovery.registrar import fit_slides
 from articulate_ssl.discovery.similar_clouds import ASKING, LabelledClouds
 from articulate_ssl.discovery.synchronization import CAP, NEIGHBOURS, unit_boxes
@@ -136,6 +137,19 @@ class SlidingSearch(WithSurface):
         rounded, step = in_few_bytes(labelled.points[:, :_LABELLED_POINTS])
         self.labelled, self.step = rounded.to(self.labelled), step.to(self.step)
         self.part = labelled.part[:, :_LABELLED_POINTS].to(self.part)
+
+    @torch.no_grad()
+    def learn_limits(
+        self,
+        chain: KinematicChain,
+        standing: Tensor,  # [n, P, 3] clouds that stand as the collection does
+        part: Tensor,  # [n, M] of their leading points
+    ) -> Tensor:  # [J, 2]
+        """Between which joint states lie, as they are read off clouds whose points have parts."""
+        shape, seen = self._shape(chain), standing[:, : part.shape[1]].to("cpu", copy=True)
+        free = replace(shape, joints=replace(shape.joints, limits=None))
+        self.limits.copy_(state_limits(fit_part_boxes(free, seen, part.long().cpu()).state))
+        return self.limits
 
     @torch.no_grad()
     def turns(

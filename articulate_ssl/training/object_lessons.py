@@ -4,8 +4,8 @@ No label is read, but which clouds show the same object is known, as where disco
 clouds (`discovery.grouped`). What these say of other objects is confirmed by how each of those moves
 (`discovery.one_object.as_others`), in a third of the time that discovery takes. An object that discovery found itself
 is asked about again, and its own clouds are among those that answer. In the end all are named alike: names that the
-few gave to kinds of objects that were rare among them may be as they came. And they teach a network that says which
-part points of other objects are of (`part_lessons`).
+few gave to kinds of objects that were rare among them may be as they came. They also say between which states joints
+are, and teach a network that says which part points of other objects are of (`part_lessons`).
 """
 
 from __future__ import annotations
@@ -58,8 +58,10 @@ def learn_objects(
     if not found or sum(len(one.part) for one in found) < _ENOUGH * len(sliding.labelled):
         return
     named = _named_alike(found, chain)
+    stood = torch.cat(standing)
     sliding.learn_labelled(named)
-    sliding.parts = teach_parts(torch.cat(standing), named.part, sliding.joints(chain)).to(sliding.points.device)
+    module.states.limits.copy_(sliding.learn_limits(chain, stood, named.part))
+    sliding.parts = teach_parts(stood, named.part, sliding.joints(chain)).to(sliding.points.device)
 
 
 def _named_alike(found: Sequence[LabelledClouds], chain: KinematicChain) -> LabelledClouds:

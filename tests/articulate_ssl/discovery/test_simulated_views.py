@@ -48,6 +48,20 @@ def test_the_shape_lies_where_the_view_shows_it(design):
     assert fit.error(seen).shape == (18,)
 
 
+def test_parts_lie_elsewhere_in_views_as_they_did():
+    _, found = _registered(DRAWER)
+    center = found.shape.part(0).mean(dim=0)  # about which a view's size stretches: canonical origins are about there
+    joints = replace(found.shape.joints, pivot=found.shape.joints.pivot - center)
+    shape = replace(found.shape, points=found.shape.points - center, joints=joints)
+    beside = torch.tensor([[0.0, 0, 0], [0.3, 0.2, 0.1]]).expand(6, 2, 3)
+    found = replace(found, shape=shape, axes=torch.eye(3).expand(2, 3, 3), beside=beside)
+    points = found.fit(torch.Generator()).posed()
+    turns = OrientationRange(60).draw(6, torch.Generator().manual_seed(0))[:, None]
+    seen, registered = simulate_views(found, points, turns, POINTS, 0.3, np.random.default_rng(0))
+    assert registered.log_stretch.std() > 0.01
+    assert nearest_distance(seen, registered.fit(torch.Generator()).posed()).max() < 1e-3
+
+
 def test_views_are_normalised_and_the_far_side_is_hidden():
     _, seen, registered = _views(LAPTOP)
     assert (seen.norm(dim=-1).mean(dim=1) - 0.3).abs().max() < 0.06  # few points, spread evenly: not as pixels are

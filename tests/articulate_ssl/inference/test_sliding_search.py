@@ -206,6 +206,18 @@ def test_labelled_clouds_say_parts_and_where_they_are(labelled):
     assert (state[:, 0] - data.state).abs().median() < 0.02
 
 
+def test_limits_are_learnt_from_clouds_whose_points_have_parts(labelled):
+    search = SlidingSearch(3, 200)
+    search.load_state_dict(labelled.state_dict())
+    search.limits.copy_(LIMITS / 10)  # no limits for what is read
+    data = clouds(CHEST, count=64, points=600, seed=5, rotate=False)
+    found = search.learn_limits(CHAIN, data.points, data.part.expand(64, -1)[:, :512])
+    assert torch.equal(found, search.limits)
+    torch.testing.assert_close(found, torch.tensor([[-0.175, 0.175]] * 2), atol=0.06, rtol=0)
+    _, _, state, _, _ = search.search(CHAIN, _chests(2, seed=6).points)
+    assert float(state.abs().max()) > 0.03
+
+
 def test_labels_are_saved_and_decide_which_part_points_are_of(labelled):
     data = _chests(2, seed=4)
     swapped = SlidingSearch(3, 200)

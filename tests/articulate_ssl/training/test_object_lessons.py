@@ -43,6 +43,7 @@ def test_clouds_of_what_is_understood_take_the_place_of_fewer(module, caplog):
     kept = sliding.labelled.float() * sliding.step[:, None, None]
     assert sorted(kept[:, 0, 0].round().int().tolist()) == [2] * 8 + [5] * 8
     assert (sliding.part.long() == torch.arange(POINTS) % 2).all()
+    assert torch.equal(module.states.limits, sliding.limits)
     assert sliding.parts.num_parts == 2 and not any(p.requires_grad for p in sliding.parts.parameters())
     assert "parts of 2 of 3 objects are understood" in caplog.text and "not this one" in caplog.text
 
