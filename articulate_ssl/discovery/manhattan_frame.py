@@ -11,8 +11,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-_STRIDE, _NEIGHBOURS = 4, 14  # normals are measured at every fourth point, from so many neighbours
-_FLATNESS = 0.1  # a neighbourhood this thin, in its own width, is a plane's; a thicker one lies across an edge
+_STRIDE = 4  # normals are measured at every fourth point
+# From so many neighbours, and how thin they are at most, in their own width, if they lie in a plane and not across an
+# edge. A noisy cloud has no planes of so few neighbours that are so thin: the first of these windows counts in which
+# enough points have one, of depth views of chests 37 % without noise in the first (docs/experiments.md, step 184).
+_WINDOWS = ((14, 0.1), (14, 0.3), (40, 0.3), (100, 0.4), (200, 0.4))
+_ENOUGH, _SMALL = 0.1, 1 / 20  # of the points where normals are measured; largest share of a cloud in a wider window
 _FEWEST = 20  # planes that make a frame; with a handful, any rotation fits
 _STARTS, _ROUNDS = 20, 12  # random rotations, each of which stands for 24
 _CAP = 10.0  # degrees: a normal further from every axis counts as this far; three times as much in the first round
@@ -22,15 +26,28 @@ def surface_normals(
     clouds: Tensor,  # [n, N, 3]
 ) -> tuple[Tensor, Tensor]:  # [n, m, 3] unit, [n, m]
     """Normals of local planes at every fourth point, up to sign, and whether there is a plane (0 or 1)."""
-    normals, planar = [], []
-    for cloud in clouds:
-        near = torch.cdist(cloud[::_STRIDE], cloud).topk(_NEIGHBOURS, largest=False).indices  # [m, k]
+    normals, planar = zip(*map(_normals, clouds), strict=True)
+    return torch.stack(normals), torch.stack(planar).to(clouds)
+
+
+def _normals(
+    cloud: Tensor,  # [N, 3]
+) -> tuple[Tensor, Tensor]:  # [m, 3], [m] bool
+    """As `surface_normals`, in the first window that sees planes, else in the first of all."""
+    first = None
+    for neighbours, flatness in _WINDOWS:
+        if first is not None and neighbours > _SMALL * len(cloud):
+            break
+        near = torch.cdist(cloud[::_STRIDE], cloud).topk(neighbours, largest=False).indices  # [m, k]
         patch = cloud[near]
         offset = patch - patch.mean(dim=1, keepdim=True)
         variance, directions = torch.linalg.eigh(offset.mT @ offset)
-        normals.append(directions[..., 0])
-        planar.append(variance[:, 0] < _FLATNESS**2 * variance[:, 1])
-    return torch.stack(normals), torch.stack(planar).to(clouds)
+        planar = variance[:, 0] < flatness**2 * variance[:, 1]
+        found = directions[..., 0], planar
+        if planar.to(cloud).mean() >= _ENOUGH:
+            return found
+        first = found if first is None else first
+    return first
 
 
 def manhattan_frames(

@@ -27,6 +27,17 @@ def test_the_frame_of_boxes_is_found_up_to_the_cube(design):
         assert angle.max() < 1
 
 
+@pytest.mark.parametrize("noise", [0.005, 0.01, 0.02])
+def test_noise_leaves_frames_of_wider_windows(noise):
+    data = clouds(DRAWER, count=6, points=4096, resample=True, seed=2)
+    noisy = data.points + noise * torch.randn(data.points.shape, generator=_generator())
+    rotation, angle = manhattan_frames(noisy, _generator())
+    cube = rotation_group(24).elements.float()
+    seen = (rotation @ data.base[:, :3, :3])[:, None].expand(-1, 24, 3, 3)
+    error = roma.rotmat_geodesic_distance(seen, cube.expand_as(seen)).amin(dim=1).rad2deg()
+    assert error.max() < 6 and angle.max() < 10
+
+
 def test_normals_are_those_of_planes_and_edges_have_none():
     plane = torch.rand(1, 2000, 3, generator=_generator()) * torch.tensor([1.0, 1.0, 0.0])
     normals, planar = surface_normals(plane)
