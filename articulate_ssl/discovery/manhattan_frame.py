@@ -19,7 +19,7 @@ _WINDOWS = ((14, 0.1), (14, 0.3), (40, 0.3), (100, 0.4), (200, 0.4))
 _ENOUGH, _SMALL = 0.1, 1 / 20  # of the points where normals are measured; largest share of a cloud in a wider window
 _FEWEST = 20  # planes that make a frame; with a handful, any rotation fits
 _STARTS, _ROUNDS = 20, 12  # random rotations, each of which stands for 24
-_CAP = 10.0  # degrees: a normal further from every axis counts as this far; three times as much in the first round
+CAP = 10.0  # degrees: a normal further from every axis counts as this far; three times as much in the first round
 
 
 def surface_normals(
@@ -63,14 +63,14 @@ def manhattan_frames(
     quaternion = functional.normalize(torch.randn(_STARTS, 4, generator=generator), dim=-1)
     rotation = roma.unitquat_to_rotmat(quaternion).to(clouds).expand(len(clouds), -1, 3, 3)
     for step in range(_ROUNDS):
-        reach = torch.tensor(_CAP * (3 - 2 * step / (_ROUNDS - 1))).deg2rad().cos()
+        reach = torch.tensor(CAP * (3 - 2 * step / (_ROUNDS - 1))).deg2rad().cos()
         seen = torch.einsum("nhij,nmj->nhmi", rotation, normals)
         largest = seen.abs().amax(dim=-1, keepdim=True)
         to_axis = seen.sign() * (seen.abs() == largest) * (largest > reach) * weight[:, None, :, None]
         rotation = roma.special_procrustes(torch.einsum("nhmi,nmj->nhij", to_axis, normals))
     angle = torch.einsum("nhij,nmj->nhmi", rotation, normals).abs().amax(dim=-1).clamp(max=1).acos().rad2deg()
-    angle = (weight[:, None] * angle.clamp(max=_CAP)).sum(dim=-1) / weight.sum(dim=-1)[:, None].clamp(min=1)
-    angle = angle.masked_fill(weight.sum(dim=1, keepdim=True) < _FEWEST, _CAP)
+    angle = (weight[:, None] * angle.clamp(max=CAP)).sum(dim=-1) / weight.sum(dim=-1)[:, None].clamp(min=1)
+    angle = angle.masked_fill(weight.sum(dim=1, keepdim=True) < _FEWEST, CAP)
     best = angle.argmin(dim=1)
     rows = torch.arange(len(clouds), device=clouds.device)
     return rotation[rows, best], angle[rows, best]

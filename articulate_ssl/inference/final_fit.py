@@ -18,6 +18,7 @@ from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.inference.candidates import Candidates
 from articulate_ssl.inference.common_shape import CommonShape
 from articulate_ssl.inference.hypothesis_registration import HypothesisRegistration
+from articulate_ssl.inference.object_frame import ObjectFrame
 from articulate_ssl.inference.part_frames import PartFrames
 from articulate_ssl.inference.proportions import Descent, fit_proportions
 from articulate_ssl.inference.view_search import ViewSearch
@@ -39,6 +40,7 @@ class FinalFit:
         part_frames: How the faces of parts lie.
         common_shape: What training clouds have in common.
         view_search: Simulated views, if there are any, know better than limits which way round objects are.
+        object_frame: How views whose parts slide are turned, if that was learnt.
         cycles: Of descent; 0 leaves proportions out.
     """
 
@@ -49,16 +51,17 @@ class FinalFit:
         part_frames: PartFrames,
         common_shape: CommonShape,
         view_search: ViewSearch,
+        object_frame: ObjectFrame,
         cycles: int,
     ) -> None:
         self.articulated, self.registration = articulated, registration
         self.part_frames, self.common_shape = part_frames, common_shape
-        self.view_search, self.cycles = view_search, cycles
+        self.view_search, self.object_frame, self.cycles = view_search, object_frame, cycles
 
     @property
     def fits(self) -> bool:
-        """Whether explanations take proportions: not where parts slide."""
-        return bool(self.cycles) and self.articulated.joint_type == REVOLUTE
+        """Whether explanations take proportions: where parts slide, only of views, and as these are turned."""
+        return bool(self.cycles) and (self.articulated.joint_type == REVOLUTE or self.object_frame.learnt)
 
     def in_proportion(
         self,
@@ -66,11 +69,18 @@ class FinalFit:
         points: Tensor,  # [B, N, 3]
         dense: Tensor | None,  # [B, P, 3]
     ) -> Hypotheses:  # H = 1
-        """Explanations in the proportions of clouds (`fit_proportions`), turned as faces say, where parts turn."""
+        """Explanations in the proportions of clouds (`fit_proportions`), turned as faces say."""
         if not self.fits:
             return one
         category = self.articulated.category.articulated_shape(self.articulated.joint_type)
         observation, frames = self.registration.observation, self.part_frames
+        if self.articulated.joint_type != REVOLUTE:
+            if dense is None:
+                return one
+            one, turned = self.object_frame.settled(one, dense)
+            known = turned, torch.zeros_like(one.state[:, 0], dtype=torch.bool)
+            descent = Descent(self.cycles, observation.bidirectional, known=known, frame=self.object_frame.axes)
+            return fit_proportions(one, category, points, descent)
         # Complete clouds, and scans that teach views, show where a hinge is.
         both = observation.bidirectional
         descent = Descent(self.cycles, both, touching=both and observation.orientation.limited)

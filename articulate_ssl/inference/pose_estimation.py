@@ -46,6 +46,7 @@ from articulate_ssl.inference.final_fit import ABOUT_AS_WELL, FinalFit
 from articulate_ssl.inference.handedness import Handedness, in_the_mirror
 from articulate_ssl.inference.hinge_sides import HingeSides
 from articulate_ssl.inference.hypothesis_registration import HypothesisRegistration
+from articulate_ssl.inference.object_frame import ObjectFrame
 from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.inference.packaging import as_prediction
 from articulate_ssl.inference.part_frames import PartFrames
@@ -89,6 +90,7 @@ class PoseEstimator:
         hinge_sides: At which side objects are hinged, if not all at the same; a module owns it.
         part_frames: How the faces of parts lie; a module owns it.
         common_shape: What training clouds have in common, if it was learnt; a module owns it.
+        object_frame: How views of what slides are turned, if it was learnt; a module owns it.
         states: Which joint states training clouds showed; a module owns it.
     """
 
@@ -114,6 +116,7 @@ class PoseEstimator:
         self.states = StateRange(articulated.num_parts - 1)
         self.part_frames = PartFrames(articulated.num_parts)
         self.common_shape = CommonShape(articulated.num_parts)
+        self.object_frame = ObjectFrame()
         self.observation = replace(observation, camera=self.hinge_sides.camera)
         self.registration = HypothesisRegistration(inference, self.observation, self.states)
         self.decision = Decision(articulated, self.registration, self.two_ways)
@@ -123,6 +126,7 @@ class PoseEstimator:
             self.part_frames,
             self.common_shape,
             self.view_search,
+            self.object_frame,
             inference.proportions,
         )
 
@@ -130,7 +134,7 @@ class PoseEstimator:
     def reads_dense(self) -> bool:
         """Whether what is decided or measured in the end reads all points of a cloud."""
         decides = self.two_ways.learnt or self.two_ways.surface is not None or self.hinge_sides.learnt
-        return bool(decides or self.part_frames.learnt)
+        return bool(decides or self.part_frames.learnt or self.object_frame.learnt)
 
     def align(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Stage 0: clouds turned roughly to canonical orientation [B, N, 3], and the pose [B, 4, 4] that undoes it."""

@@ -33,6 +33,7 @@ class Descent(NamedTuple):
         faces: [K, 3, 3] columns, axes along which parts stretch instead of their principal ones, which of a body about
             as wide as high are any; then it would shear.
         known: [B] and [B, J] bool: which clouds stay turned as they are, and which joint states stay.
+        frame: [3, 3] columns, axes of the object, whose parts slide: all stretch along these, and may lie elsewhere.
     """
 
     cycles: int
@@ -40,6 +41,7 @@ class Descent(NamedTuple):
     touching: bool = False
     faces: Tensor | None = None
     known: tuple[Tensor, Tensor] | None = None
+    frame: Tensor | None = None
 
 
 def fit_proportions(
@@ -72,7 +74,7 @@ def descended(
     descent: Descent,
 ) -> tuple[InstanceFit, Tensor]:  # , [B, 4, 4]
     """See `fit_proportions`: the fit to clouds in the frames of explanations, and their poses before it."""
-    cycles, both, touching, faces, known = descent
+    cycles, both, touching, faces, known, frame = descent
     # A test runs in inference mode, whose tensors no gradient goes through.
     with torch.inference_mode(False):
         lines = replace(category.joints, axis=one.axis[:, 0].clone(), pivot=one.pivot.clone())
@@ -81,7 +83,9 @@ def descended(
         base = one.base[:, 0].clone()
         seen, still = transform_points(invert_se3(base), points.clone()), torch.eye(4).to(base).expand_as(base)
         faces = None if faces is None else faces.clone()
-        fit = InstanceFit(shape, still, one.state[:, 0].clone(), torch.Generator().manual_seed(0), faces=faces)
+        axes = None if frame is None else frame.expand(shape.num_parts, 3, 3).clone()
+        generator = torch.Generator().manual_seed(0)
+        fit = InstanceFit(shape, still, one.state[:, 0].clone(), generator, axes, faces=faces)
         known = None if known is None else tuple(value.clone() for value in known)
         fit.optimise(seen, cycles, shared=False, bidirectional=both, touching=touching, known=known)
         return fit, base

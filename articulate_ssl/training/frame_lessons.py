@@ -1,7 +1,7 @@
 """What `inference.part_frames` and `inference.common_shape` are learnt from: predictions of training clouds.
 
 How the faces of their parts lie; then, of complete clouds, where joint lines are (`line_lessons`), and where faces say
-how clouds are turned, what they have in common.
+how clouds are turned, what they have in common. Or, where parts slide, how views are turned (`inference.object_frame`).
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from trimesh.bounds import oriented_bounds
 
+from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.inference.part_frames import WINDOWS, Faces, faces_of
 from articulate_ssl.inference.proportions import Descent, descended
@@ -43,9 +44,12 @@ def learn_part_frames(
 ) -> None:
     """Find out which parts have faces that say how they are turned, then where joint lines are and what is common.
 
-    The latter two of complete clouds alone.
+    The latter two of complete clouds alone. Where parts slide, it is how whole objects are turned.
     """
     estimator = module.estimator
+    if module.articulated.joint_type != REVOLUTE:
+        _learn_object_frame(module, clouds)
+        return
     frames = estimator.part_frames
     frames.flat.fill_(False)
     estimator.common_shape.forget()
@@ -69,6 +73,21 @@ def learn_part_frames(
     explained = learn_joint_lines(module, explained, clouds[few])
     if frames.learnt:
         _learn_common_shape(module, explained, clouds[few])
+
+
+def _learn_object_frame(module: ArticulatedPoseModule, clouds: Tensor) -> None:
+    """How views of what slides are turned."""
+    network, frame = module.articulated, module.estimator.object_frame
+    frame.forget()
+    explained = explain(module, clouds, "frames of views")
+    start = object_axes(network.category.articulated_shape(network.joint_type))
+    share = frame.learn(explained.base[:, 0, :3, :3], clouds, start * torch.linalg.det(start).sign())
+    tell(
+        log,
+        "%.0f %% of views are nearly square to their Manhattan frame: it %s how they are turned",
+        100 * share,
+        "says" if frame.learnt else "does not say",
+    )
 
 
 def _learn_common_shape(module: ArticulatedPoseModule, explained: Hypotheses, clouds: Tensor) -> None:

@@ -99,7 +99,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             images of the others (`inference.handedness`); 0 learns nothing of it.
         part_frames_samples: Training clouds from which it is learnt which parts have faces that say how they are
             turned, where parts turn (`inference.part_frames`), and if so, of complete clouds, which shape they have in
-            common (`inference.common_shape`); 0 learns nothing of it.
+            common (`inference.common_shape`); or, where parts slide, how views of them are (`inference.object_frame`);
+            0 learns nothing of it.
         hinge_sides_samples: Training clouds from which it is learnt whether some objects are hinged at another side
             than most (`inference.hinge_sides`); 0 learns nothing of it.
         orientation_range: How far objects are turned from their mean orientation at most, in degrees; 180 stands for
@@ -159,6 +160,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         self.view_search, self.handedness = self.estimator.view_search, self.estimator.handedness
         self.hinge_sides, self.states = self.estimator.hinge_sides, self.estimator.states
         self.part_frames, self.common_shape = self.estimator.part_frames, self.estimator.common_shape
+        self.object_frame = self.estimator.object_frame
         self.recipe = recipe_type(self.estimator, objective, schedule, discovery)
         self.radius = RadiusStatistics()
         self.confidence = Confidence()
@@ -218,6 +220,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         training = self.training
         self.eval()
         turns, refines = self.articulated.joint_type == REVOLUTE, bool(self.inference.refine)
+        views = self.view_search.learnt
         any_way = not self.orientation.limited
         # Where the frames of the collection have said which way round clouds are, nothing is left to decide.
         decides = refines and any_way and not self.sliding.learnt
@@ -229,7 +232,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             "turns": (learn_turns, self.two_ways_samples if refines and any_way and self.sliding.learnt else 0),
             "objects": (learn_objects, self.object_samples if refines and len(self.sliding.labelled) else 0),
             "handedness": (learn_handedness, 0 if any_way else self.handedness_samples),
-            "part_frames": (learn_part_frames, self.part_frames_samples if refines and turns else 0),
+            "part_frames": (learn_part_frames, self.part_frames_samples if refines and (turns or views) else 0),
             "hinge_sides": (learn_hinge_sides, self.hinge_sides_samples if refines else 0),
             "joint_limits": limits,
             "confidence": (learn_confidence, calibration),

@@ -7,42 +7,20 @@ import pytest
 import torch
 from articulated_objects import OVEN, clouds, true_shape
 from tiny import POINTS, tiny_module
+from true_category import Category
 
 from articulate_ssl.geometry.screw import PRISMATIC
 from articulate_ssl.inference.candidates import Candidates
 from articulate_ssl.inference.common_shape import CommonShape
 from articulate_ssl.inference.final_fit import FinalFit
 from articulate_ssl.inference.hypothesis_registration import HypothesisRegistration
+from articulate_ssl.inference.object_frame import ObjectFrame
 from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.inference.part_frames import PartFrames
 from articulate_ssl.inference.state_range import StateRange
 from articulate_ssl.inference.view_search import ViewSearch
-from articulate_ssl.network.heads.shape import CanonicalShape
-from articulate_ssl.network.heads.structure import Structure
 from articulate_ssl.network.hypotheses import Hypotheses
-from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.observation import Observation
-
-
-class _Network:
-    """Stands in for the network: a category that is an object's true shape."""
-
-    def __init__(self, shape: ArticulatedShape) -> None:
-        self.shape, self.joint_type = shape, shape.joints.joint_type
-        self.category = SimpleNamespace(articulated_shape=lambda _type: shape)
-
-    def category_at(self, base: torch.Tensor, state: torch.Tensor) -> Hypotheses:
-        shape, (count, poses) = self.shape, base.shape[:2]
-        parts = torch.stack([shape.part(part) for part in range(shape.num_parts)])
-        center = parts.mean(dim=1)
-        axis, pivot = shape.joints.axis.expand(count, poses, -1, 3), shape.joints.pivot.expand(count, -1, 3)
-        return Hypotheses(
-            CanonicalShape(*(x.expand(count, *x.shape) for x in (parts - center[:, None], center))),
-            Structure(torch.zeros(count, 1), pivot, axis, pivot, axis, shape.joints.chain, self.joint_type),
-            base,
-            state,
-            torch.zeros(count, 0, shape.num_parts),
-        )
 
 
 @pytest.fixture
@@ -58,8 +36,10 @@ def final(data) -> FinalFit:
     states.limits.copy_(torch.tensor([[0.4, 1.6]]))
     options = InferenceOptions(refine=True, proportions=6)
     registration = HypothesisRegistration(options, Observation(), states)
-    network = _Network(replace(shape, points=shape.points[order], label=shape.label[order]))
-    return FinalFit(network, registration, PartFrames(2), CommonShape(2), ViewSearch(2), options.proportions)
+    network = Category(replace(shape, points=shape.points[order], label=shape.label[order]))
+    return FinalFit(
+        network, registration, PartFrames(2), CommonShape(2), ViewSearch(2), ObjectFrame(), options.proportions
+    )
 
 
 def _at(final: FinalFit, data, state: torch.Tensor) -> Hypotheses:
