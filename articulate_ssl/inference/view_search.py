@@ -19,6 +19,7 @@ from torch.nn.functional import one_hot
 from articulate_ssl.discovery.registration import register_rigid
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.inference.candidates import rivals
+from articulate_ssl.inference.view_parts import ViewParts
 from articulate_ssl.inference.votes import Votes
 from articulate_ssl.ops.chamfer import nearest_distance, nearest_index
 from articulate_ssl.ops.few_bytes import from_few_bytes, in_few_bytes
@@ -57,11 +58,13 @@ class ViewSearch(nn.Module):
         part: [V, P] uint8, which part their points are of.
         base: [V, 4, 4] canonical object space -> view.
         state: [V, J] joint states.
+        parts: Which part points are of, if views have taught that.
     """
 
     def __init__(self, num_parts: int) -> None:
         super().__init__()
         self.num_parts = num_parts
+        self.register_module("parts", None)
         self.register_buffer("views", torch.zeros(0, _POINTS, 3, dtype=torch.int8))
         self.register_buffer("step", torch.zeros(0))
         self.register_buffer("part", torch.zeros(0, _POINTS, dtype=torch.uint8))
@@ -90,6 +93,11 @@ class ViewSearch(nn.Module):
         self.views = views.to(self.views)
         self.part = part[some, :_POINTS].to(self.part, copy=True)
         self.step, self.base, self.state = (value.to(self.base, copy=True) for value in (step, base[some], state[some]))
+
+    @property
+    def standing(self) -> Tensor:  # [V, P, 3]
+        """The views, turned as canonical object space is."""
+        return from_few_bytes(self.views.to(self.base), self.step) @ self.base[:, :3, :3]
 
     @torch.no_grad()
     def search(
@@ -134,4 +142,6 @@ class ViewSearch(nn.Module):
             own = getattr(self, name)
             value = state_dict.setdefault(prefix + name, own.clone())
             setattr(self, name, torch.empty_like(value, dtype=own.dtype, device=own.device))
+        taught = any(name.startswith(f"{prefix}parts.") for name in state_dict)
+        self.parts = ViewParts(self.num_parts).to(self.base).requires_grad_(False) if taught else None
         super()._load_from_state_dict(state_dict, prefix, *rest)

@@ -1,7 +1,8 @@
 """What `inference.part_frames` and `inference.common_shape` are learnt from: predictions of training clouds.
 
 How the faces of their parts lie; then, of complete clouds, where joint lines are (`line_lessons`), and where faces say
-how clouds are turned, what they have in common. Or, where parts slide, how views are turned (`inference.object_frame`).
+how clouds are turned, what they have in common. Or, where parts slide, how views are turned (`inference.object_frame`)
+and which part their points are of (`view_lessons`).
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from articulate_ssl.shape.object_axes import object_axes
 from articulate_ssl.shape.part_maps import PartMaps
 from articulate_ssl.training.explanations import registered_points
 from articulate_ssl.training.line_lessons import explain, learn_joint_lines
+from articulate_ssl.training.view_lessons import teach_view_parts
 
 if TYPE_CHECKING:
     from articulate_ssl.training.module import ArticulatedPoseModule
@@ -76,18 +78,17 @@ def learn_part_frames(
 
 
 def _learn_object_frame(module: ArticulatedPoseModule, clouds: Tensor) -> None:
-    """How views of what slides are turned."""
-    network, frame = module.articulated, module.estimator.object_frame
+    """How views of what slides are turned; and as that is known, which part their points are of."""
+    network, frame, search = module.articulated, module.estimator.object_frame, module.view_search
     frame.forget()
+    search.parts = None
     explained = explain(module, clouds, "frames of views")
     start = object_axes(network.category.articulated_shape(network.joint_type))
     share = frame.learn(explained.base[:, 0, :3, :3], clouds, start * torch.linalg.det(start).sign())
-    tell(
-        log,
-        "%.0f %% of views are nearly square to their Manhattan frame: it %s how they are turned",
-        100 * share,
-        "says" if frame.learnt else "does not say",
-    )
+    says = "says" if frame.learnt else "does not say"
+    tell(log, "%.0f %% of views are nearly as their Manhattan frame: it %s how they are turned", 100 * share, says)
+    if frame.learnt:
+        search.parts = teach_view_parts(search.standing @ frame.axes, search.part, module.num_parts)
 
 
 def _learn_common_shape(module: ArticulatedPoseModule, explained: Hypotheses, clouds: Tensor) -> None:

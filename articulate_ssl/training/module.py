@@ -99,8 +99,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             images of the others (`inference.handedness`); 0 learns nothing of it.
         part_frames_samples: Training clouds from which it is learnt which parts have faces that say how they are
             turned, where parts turn (`inference.part_frames`), and if so, of complete clouds, which shape they have in
-            common (`inference.common_shape`); or, where parts slide, how views of them are (`inference.object_frame`);
-            0 learns nothing of it.
+            common (`inference.common_shape`); or, where parts slide, how views of them are (`inference.object_frame`),
+            and which part their points are of (`inference.view_parts`, ten minutes); 0 learns nothing of it.
         hinge_sides_samples: Training clouds from which it is learnt whether some objects are hinged at another side
             than most (`inference.hinge_sides`); 0 learns nothing of it.
         orientation_range: How far objects are turned from their mean orientation at most, in degrees; 180 stands for
@@ -255,7 +255,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         """Adam; the category's shapes and joints are a group of their own."""
         shared = list(self.articulated.category.parameters())
         # What is learnt after the last step is not trained with the rest, nor when a run that ended goes on.
-        taught = (self.two_ways, self.hinge_sides, self.sliding)
+        taught = (self.two_ways, self.hinge_sides, self.sliding, self.view_search)
         elsewhere = set(map(id, (*shared, *(parameter for some in taught for parameter in some.parameters()))))
         others = [p for p in self.parameters() if id(p) not in elsewhere]
         optimizer = torch.optim.Adam(

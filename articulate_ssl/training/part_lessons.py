@@ -7,6 +7,7 @@ its parts have slid (`discovery.varied_clouds`), so that a hundred objects show 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -21,7 +22,7 @@ from articulate_ssl.ops.progress import announced, tell
 from articulate_ssl.ops.spin_images import DENSE_POINTS, spin_images
 from articulate_ssl.shape.joints import Joints
 
-_STEPS, _BATCH, _RATE = 2000, 16, 2e-3  # of 179 chests: .86 of unseen ones after 500 steps, .91 after 1,000
+_STEPS, BATCH, _RATE = 2000, 16, 2e-3  # of 179 chests: .86 of unseen ones after 500 steps, .91 after 1,000
 _UNMOVED = 5  # clouds of a batch whose parts stay where they are
 _SHOWN = 2  # times as many points as the network reads are known, of which it reads some
 _SMOOTHING = 0.05  # of labels, of which some are wrong
@@ -66,9 +67,9 @@ class PartLessons(NamedTuple):
 
     def draw(self, joints: Joints, read: int, generator: torch.Generator) -> PartLessons:
         """Some of the clouds, of points drawn anew, in other proportions and joint states."""
-        rows = torch.randint(len(self.part), (_BATCH, 1), generator=generator)
+        rows = torch.randint(len(self.part), (BATCH, 1), generator=generator)
         # In farthest-point order again, so that what is left after a layer is even.
-        seen = torch.rand(_BATCH, self.part.shape[1], generator=generator).argsort(dim=1)[:, :read].sort(dim=1).values
+        seen = torch.rand(BATCH, self.part.shape[1], generator=generator).argsort(dim=1)[:, :read].sort(dim=1).values
         boxes, images, normal, part = (x[rows, seen] for x in self)
         still, moved = boxes[:_UNMOVED], LabelledClouds(boxes[_UNMOVED:], part[_UNMOVED:])
         copies = in_other_proportions(still, 1, generator)[_UNMOVED:], in_other_states(moved, joints, generator)
@@ -81,22 +82,41 @@ def teach_parts(
     joints: Joints,  # of the parts, in that frame
 ) -> PartNetwork:
     """A new network that has learnt them."""
-    generator = torch.Generator().manual_seed(0)
-    with torch.random.fork_rng(devices=[]), torch.enable_grad():
+    with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         network = PartNetwork(joints.chain.num_parts)
         lessons = PartLessons.of(standing, part, _SHOWN * network.size.read)
+
+        def drawn(generator: torch.Generator) -> tuple[Tensor, Tensor]:
+            shown = lessons.draw(joints, network.size.read, generator)
+            return network.logits(*shown[:3]), shown.part
+
+        teach(network, drawn, f"parts of {len(standing)} clouds")
+        return network
+
+
+def teach(
+    network: nn.Module,
+    drawn: Callable[[torch.Generator], tuple[Tensor, Tensor]],
+    what: str,
+) -> None:
+    """Teach a network parts; afterwards it does not learn any more.
+
+    Args:
+        drawn: What it says of a batch of clouds [B, N, K], and which part their points are of [B, N].
+        what: It learns, as progress is called.
+    """
+    generator, loss = torch.Generator().manual_seed(0), torch.tensor(0.0)
+    with torch.enable_grad():
         optimizer = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=_DECAY)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _STEPS)
-        loss = torch.tensor(0.0)
-        for _ in announced(log, "a network learns parts", range(_STEPS)):
-            shown = lessons.draw(joints, network.size.read, generator)
-            logits = network.logits(*shown[:3])
-            loss = functional.cross_entropy(logits.flatten(0, 1), shown.part.flatten(), label_smoothing=_SMOOTHING)
+        for _ in announced(log, f"a network learns {what}", range(_STEPS)):
+            logits, part = drawn(generator)
+            loss = functional.cross_entropy(logits.flatten(0, 1), part.flatten(), label_smoothing=_SMOOTHING)
             optimizer.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(network.parameters(), _GRADIENT_NORM)
             optimizer.step()
             schedule.step()
-    tell(log, "a network has learnt parts of %d clouds, to a loss of %.2f", len(standing), loss.item())
-    return network.eval().requires_grad_(False)
+    tell(log, "a network has learnt %s, to a loss of %.2f", what, loss.item())
+    network.eval().requires_grad_(False)
