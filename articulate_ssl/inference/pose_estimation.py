@@ -238,7 +238,7 @@ class PoseEstimator:
             error = self.final.distance(chosen, points)
             if registers and fits:
                 chosen, other, margin = self.final.within_limits(chosen, other, margin, points, dense)
-                if self.view_search.parts is not None and dense is not None:
+                if self.view_search.parts is not None and self.object_frame.learnt and dense is not None:
                     turn = (chosen.base[:, 0, :3, :3] @ self.object_frame.axes).mT
                     votes = self.view_search.parts.beside(votes, dense, turn)
             rival = self._packaged(other, points, torch.zeros_like(margin))

@@ -78,7 +78,7 @@ class ViewSearch(nn.Module):
 
     def forget(self) -> None:
         """As before there were any."""
-        self.views = self.views[:0]
+        self.views, self.parts = self.views[:0], None
 
     def learn(
         self,

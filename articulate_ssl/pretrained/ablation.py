@@ -66,6 +66,10 @@ def _no_network_of_parts(estimator: PoseEstimator) -> None:
     estimator.sliding.parts = None
 
 
+def _no_network_of_views_parts(estimator: PoseEstimator) -> None:
+    estimator.view_search.parts = None
+
+
 ABLATIONS = (
     Ablation(NOTHING, lambda _: True, lambda _: None),
     Ablation(
@@ -82,6 +86,14 @@ ABLATIONS = (
     ),
     Ablation("the search in the collection", lambda of: of.sliding.learnt, lambda of: of.sliding.forget()),
     Ablation("the search among simulated views", lambda of: of.view_search.learnt, lambda of: of.view_search.forget()),
+    Ablation(
+        "the network that says parts of views",
+        lambda of: of.view_search.parts is not None,
+        _no_network_of_views_parts,
+    ),
+    Ablation(
+        "how views are square, and that network", lambda of: of.object_frame.learnt, lambda of: of.object_frame.forget()
+    ),
     Ablation("which side is up", lambda of: bool(of.hinge_sides.learnt), _no_sides),
     Ablation("mirror images", lambda of: bool(of.handedness.learnt), lambda of: of.handedness.learnt.fill_(False)),
     Ablation("joint limits", lambda of: of.states.learnt, lambda of: of.states.forget()),

@@ -56,6 +56,8 @@ def test_networks_are_saved_with_views():
     other.load_state_dict(search.state_dict())
     assert torch.equal(other.parts.point[0].weight, search.parts.point[0].weight)
     assert not other.parts.point[0].weight.requires_grad
+    search.forget()
+    assert search.parts is None
     other.load_state_dict(ViewSearch(3).state_dict())
     assert other.parts is None
 
