@@ -20,10 +20,7 @@ from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.se3 import se3
 from articulate_ssl.network.hypotheses import Hypotheses
 
-_REACH = (
-    40.0,
-    20.0,
-)  # degrees: predictions farther from their frames do not count, in the first rounds and in the last
+_REACH = (40.0, 20.0)  # degrees: predictions farther from their frames do not count, in the first round and in the last
 _ROUNDS = 6
 _SHARE = 0.8  # the frame is learnt if so many of the views have one near their predictions. Chosen.
 _PARALLEL = 5.0  # degrees: a joint that is so near to an axis of the frame is parallel to that

@@ -2,8 +2,8 @@
 
 Views that are alike say it, too (`view_search`), and so does the shape that is fitted to the view; the three together
 are right more often than any two (docs/experiments.md, step 185). It is taught by simulated views
-(`training/view_lessons.py`) and sees where points are, not what surfaces are like: simulated views have few points, and
-in spin images of them a network learns what those of a camera do not show.
+(`training/view_lessons.py`), of which few points are kept, and sees where these are, not what surfaces are like: with
+spin images of denser views it was no better.
 """
 
 from __future__ import annotations
