@@ -8,13 +8,14 @@ object has alone, and without pieces that are of another part. No label is read.
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from articulate_ssl.inference.late_buffers import LateBuffers
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.joints import Joints
 
 
-class CommonShape(nn.Module):
+class CommonShape(LateBuffers):
     """Points of K parts, once they are learnt.
 
     Attributes:
@@ -29,9 +30,7 @@ class CommonShape(nn.Module):
         self.register_buffer("pivot", torch.zeros(num_parts - 1, 3))
 
     def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
-        for name, value in self.named_buffers(recurse=False):  # weights from before there was one
-            state_dict.setdefault(prefix + name, value.clone())
-        self.points = self.points.new_zeros(state_dict[prefix + "points"].shape)
+        self.points = self.points.new_zeros(state_dict.get(prefix + "points", self.points).shape)
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     @property

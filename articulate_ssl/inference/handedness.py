@@ -16,10 +16,11 @@ import logging
 from dataclasses import fields, replace
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import se3
+from articulate_ssl.inference.late_buffers import LateBuffers
 from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.ops.progress import tell
 
@@ -34,7 +35,7 @@ _ROUNDS = 100  # of expectation and maximisation
 log = logging.getLogger(__name__)
 
 
-class Handedness(nn.Module):
+class Handedness(LateBuffers):
     """Whether a cloud shows the category's mirror image.
 
     Attributes:
@@ -118,12 +119,6 @@ class Handedness(nn.Module):
             _either(odds > 0, self.mirrored_back(there), here) for here, there in zip(seen, mirrored, strict=True)
         )
         return replace(chosen, margin=chosen.margin.minimum((odds.abs() / 2).tanh())), rival
-
-    def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
-        """Weights from before there were hands know of none."""
-        for name, value in self.named_buffers():
-            state_dict.setdefault(prefix + name, value.clone())
-        super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
 def in_the_mirror(points: Tensor) -> Tensor:

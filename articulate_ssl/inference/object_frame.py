@@ -13,11 +13,12 @@ from dataclasses import replace
 
 import roma
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from articulate_ssl.discovery.manhattan_frame import CAP, manhattan_frames
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.se3 import se3
+from articulate_ssl.inference.late_buffers import LateBuffers
 from articulate_ssl.network.hypotheses import Hypotheses
 
 _REACH = (40.0, 20.0)  # degrees: predictions farther from their frames do not count, in the first round and in the last
@@ -26,7 +27,7 @@ _SHARE = 0.8  # the frame is learnt if so many of the views have one near their 
 _PARALLEL = 5.0  # degrees: a joint that is so near to an axis of the frame is parallel to that
 
 
-class ObjectFrame(nn.Module):
+class ObjectFrame(LateBuffers):
     """Of a category, in canonical object space.
 
     Attributes:
@@ -38,11 +39,6 @@ class ObjectFrame(nn.Module):
         super().__init__()
         self.register_buffer("axes", torch.eye(3))
         self.register_buffer("known", torch.zeros((), dtype=torch.bool))
-
-    def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
-        for name, value in self.named_buffers(recurse=False):  # weights from before there was any
-            state_dict.setdefault(prefix + name, value.clone())
-        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     @property
     def learnt(self) -> bool:

@@ -20,10 +20,11 @@ from typing import NamedTuple
 
 import roma
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
 from articulate_ssl.geometry.se3 import se3
+from articulate_ssl.inference.late_buffers import LateBuffers
 from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.ops.chamfer import nearest_distance
 
@@ -48,7 +49,7 @@ _BOX = 0.05
 _PARALLEL = 5.0  # degrees: a joint that is so near to an axis of the box that it is on is parallel to that
 
 
-class PartFrames(nn.Module):
+class PartFrames(LateBuffers):
     """Of a category's parts, in canonical object space at joint states zero.
 
     Attributes:
@@ -68,11 +69,6 @@ class PartFrames(nn.Module):
         self.register_buffer("axes", torch.eye(3).repeat(num_parts, 1, 1))
         self.register_buffer("measured", torch.zeros(num_parts - 1, dtype=torch.bool))
         self.register_buffer("direction", torch.zeros(num_parts - 1, 3))
-
-    def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
-        for name, value in self.named_buffers(recurse=False):  # weights from before there were any
-            state_dict.setdefault(prefix + name, value.clone())
-        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     @property
     def learnt(self) -> bool:

@@ -14,8 +14,10 @@ import math
 
 import roma
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
+
+from articulate_ssl.inference.late_buffers import LateBuffers
 
 FEWEST = 60  # clouds from which it is learnt. Chosen.
 _TURNS = 4
@@ -26,7 +28,7 @@ _MOST = 0.7  # share of the clouds that it is the mean of: others may lie on the
 _STANDS = math.radians(40)
 
 
-class UprightCamera(nn.Module):
+class UprightCamera(LateBuffers):
     """Which way is up.
 
     Attributes:
@@ -42,11 +44,6 @@ class UprightCamera(nn.Module):
         self.register_buffer("up", torch.zeros(3))
         self.register_buffer("vertical", torch.zeros(3))
         self.register_buffer("normal", torch.zeros(3))
-
-    def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
-        for name, value in self.named_buffers():  # weights from before there were any
-            state_dict.setdefault(prefix + name, value.clone())
-        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def forget(self) -> None:
         """As before it was learnt."""
