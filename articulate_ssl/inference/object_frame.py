@@ -85,10 +85,10 @@ class ObjectFrame(LateBuffers):
         new = torch.where(has[:, None, None], _nearest(frame, self.axes, old)[0], old)
         middle = one.object_shape().flatten(1, 2).mean(dim=1, keepdim=True)
         place = one.base[:, 0, :3, 3] + (middle @ (old - new).mT).squeeze(1)
-        structure = replace(one.structure, axis=self._parallel(one.axis))
+        structure = replace(one.structure, axis=self.parallel(one.axis))
         return replace(one, structure=structure).at(se3(new, place)[:, None], one.state), has
 
-    def _parallel(self, axis: Tensor) -> Tensor:
+    def parallel(self, axis: Tensor) -> Tensor:
         """Joint axes [..., 3], those that are nearly parallel to the frame exactly so."""
         cosine = axis @ self.axes
         largest = cosine.abs().amax(dim=-1, keepdim=True)

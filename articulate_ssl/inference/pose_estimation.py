@@ -11,7 +11,8 @@
    Where parts slide, clouds of other objects that are most like it decide which way round it is; where these are
    labelled, they say which parts points are of, and where the category's shape is (`sliding_search`).
    Where simulated views taught, those that a view is most like decide which way round it is, and say with the
-   posed shape which parts points are of (`view_search`).
+   posed shape which parts points are of (`view_search`); what slides is in the end where these points are
+   (`front_ends`).
 4. *Decision* between two explanations of a cloud, where that was learnt (`decision`): the winner and its twin, which is
    registered, too, if the winner was, or the winner and its rival.
 5. *Side*, where some doors are hinged at another side than most: frames are turned so that what is seen looks right
@@ -43,6 +44,7 @@ from articulate_ssl.inference.candidates import (
 from articulate_ssl.inference.common_shape import CommonShape
 from articulate_ssl.inference.decision import Decision
 from articulate_ssl.inference.final_fit import ABOUT_AS_WELL, FinalFit
+from articulate_ssl.inference.front_ends import FrontEnds
 from articulate_ssl.inference.handedness import Handedness, in_the_mirror
 from articulate_ssl.inference.hinge_sides import HingeSides
 from articulate_ssl.inference.hypothesis_registration import HypothesisRegistration
@@ -91,6 +93,7 @@ class PoseEstimator:
         part_frames: How the faces of parts lie; a module owns it.
         common_shape: What training clouds have in common, if it was learnt; a module owns it.
         object_frame: How views of what slides are turned, if it was learnt; a module owns it.
+        front_ends: Which ends of what slides views show, if it was learnt; a module owns it.
         states: Which joint states training clouds showed; a module owns it.
     """
 
@@ -117,6 +120,7 @@ class PoseEstimator:
         self.part_frames = PartFrames(articulated.num_parts)
         self.common_shape = CommonShape(articulated.num_parts)
         self.object_frame = ObjectFrame()
+        self.front_ends = FrontEnds(articulated.num_parts - 1)
         self.observation = replace(observation, camera=self.hinge_sides.camera)
         self.registration = HypothesisRegistration(inference, self.observation, self.states)
         self.decision = Decision(articulated, self.registration, self.two_ways)
@@ -242,7 +246,12 @@ class PoseEstimator:
                     turn = (chosen.base[:, 0, :3, :3] @ self.object_frame.axes).mT
                     votes = self.view_search.parts.beside(votes, dense, turn)
             rival = self._packaged(other, points, torch.zeros_like(margin))
-            return self._packaged(chosen, points, margin, votes, dense), rival, error
+            found = self._packaged(chosen, points, margin, votes, dense)
+            if registers and fits and dense is not None and self.front_ends.learnt:
+                category = self.articulated.category.articulated_shape(self.articulated.joint_type)
+                chosen = self.front_ends.placed(chosen, self.object_frame, category, dense, found.dense_part_id)
+                found = self._packaged(chosen, points, margin, votes, dense)
+            return found, rival, error
 
     def _as_most_are(
         self,

@@ -1,8 +1,8 @@
 """What `inference.part_frames` and `inference.common_shape` are learnt from: predictions of training clouds.
 
 How the faces of their parts lie; then, of complete clouds, where joint lines are (`line_lessons`), and where faces say
-how clouds are turned, what they have in common. Or, where parts slide, how views are turned (`inference.object_frame`)
-and which part their points are of (`view_lessons`).
+how clouds are turned, what they have in common. Or, where parts slide, how views are turned (`inference.object_frame`),
+which part their points are of (`view_lessons`), and which ends of parts they show (`inference.front_ends`).
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ from trimesh.bounds import oriented_bounds
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.inference.part_frames import WINDOWS, Faces, faces_of
+from articulate_ssl.inference.prediction import concatenate
 from articulate_ssl.inference.proportions import Descent, descended
 from articulate_ssl.network.hypotheses import Hypotheses
-from articulate_ssl.ops.progress import tell
+from articulate_ssl.ops.progress import announced, tell
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.fusion import fused
 from articulate_ssl.shape.object_axes import object_axes
@@ -78,9 +79,11 @@ def learn_part_frames(
 
 
 def _learn_object_frame(module: ArticulatedPoseModule, clouds: Tensor) -> None:
-    """How views of what slides are turned; and as that is known, which part their points are of."""
-    network, frame, search = module.articulated, module.estimator.object_frame, module.view_search
+    """How views of what slides are turned; and as that is known, which part their points are of, and where they end."""
+    network, frame, search = module.articulated, module.object_frame, module.view_search
+    ends = module.front_ends
     frame.forget()
+    ends.forget()
     search.parts = None
     explained = explain(module, clouds, "frames of views")
     start = object_axes(network.category.articulated_shape(network.joint_type))
@@ -89,6 +92,21 @@ def _learn_object_frame(module: ArticulatedPoseModule, clouds: Tensor) -> None:
     tell(log, "%.0f %% of views are nearly as their Manhattan frame: it %s how they are turned", 100 * share, says)
     if frame.learnt:
         search.parts = teach_view_parts(search.standing @ frame.axes, search.part, module.num_parts)
+        _learn_front_ends(module, clouds)
+
+
+def _learn_front_ends(module: ArticulatedPoseModule, clouds: Tensor) -> None:
+    """Which ends of what slides views show."""
+    network = module.articulated
+    shown = announced(log, "ends of parts that views show", clouds.split(_BATCH))
+    count, read = registered_points(module), module.num_points
+    found = concatenate([module.estimator.predict(some[:, :count], read, dense=some) for some in shown])
+    category = network.category.articulated_shape(network.joint_type)
+    turn, part = found.base_pose[:, :3, :3], found.dense_part_id
+    with_fits = module.front_ends.learn(module.object_frame, category, turn, clouds, part, found.joint_state)
+    does = "are fronts" if module.front_ends.learnt else "say nothing: what is read at either does not go with fits"
+    shares = ", ".join(f"{value:.2f}" for value in with_fits.tolist())
+    tell(log, "ends of parts %s (correlation with what was fitted: %s)", does, shares)
 
 
 def _learn_common_shape(module: ArticulatedPoseModule, explained: Hypotheses, clouds: Tensor) -> None:

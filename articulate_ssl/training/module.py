@@ -100,7 +100,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         part_frames_samples: Training clouds from which it is learnt which parts have faces that say how they are
             turned, where parts turn (`inference.part_frames`), and if so, of complete clouds, which shape they have in
             common (`inference.common_shape`); or, where parts slide, how views of them are (`inference.object_frame`),
-            and which part their points are of (`inference.view_parts`, ten minutes); 0 learns nothing of it.
+            which part their points are of (`inference.view_parts`, ten minutes), and which ends of parts they show
+            (`inference.front_ends`); 0 learns nothing of it.
         hinge_sides_samples: Training clouds from which it is learnt whether some objects are hinged at another side
             than most (`inference.hinge_sides`); 0 learns nothing of it.
         orientation_range: How far objects are turned from their mean orientation at most, in degrees; 180 stands for
@@ -160,7 +161,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         self.view_search, self.handedness = self.estimator.view_search, self.estimator.handedness
         self.hinge_sides, self.states = self.estimator.hinge_sides, self.estimator.states
         self.part_frames, self.common_shape = self.estimator.part_frames, self.estimator.common_shape
-        self.object_frame = self.estimator.object_frame
+        self.object_frame, self.front_ends = self.estimator.object_frame, self.estimator.front_ends
         self.recipe = recipe_type(self.estimator, objective, schedule, discovery)
         self.radius = RadiusStatistics()
         self.confidence = Confidence()

@@ -81,3 +81,33 @@ def test_stretches_are_bounded_and_parts_stay_at_their_centres():
         )
         middle, truth = (box.mean(dim=0) for box in boxes)
         torch.testing.assert_close(middle, truth, atol=1e-2, rtol=0)
+
+
+def _views(count: int):
+    """A chest, and clouds that show of its drawers the front third of their depth alone, and of its body all."""
+    data = clouds(CHEST, count=count, points=1500, rotate=False)
+    shape = true_shape(CHEST, data)
+    depth = data.rest[:, 0]
+    seen = (data.part == 0) | (depth > 0.28)
+    return data, shape, data.points[:, seen], data.part[seen].expand(count, -1)
+
+
+def test_where_views_show_fronts_states_are_how_far_these_are_from_the_bodys():
+    data, shape, points, part = _views(8)
+    fronts = torch.ones(2)
+    found = fit_part_boxes(shape, points, part, fronts)
+    torch.testing.assert_close(found.state, data.state, atol=0.02, rtol=0)
+    torch.testing.assert_close(found.posed(), data.points, atol=0.03, rtol=0)  # what is not seen is there, too
+    assert (fit_part_boxes(shape, points, part).state - data.state).abs().mean() > 0.05
+    assert (fit_part_boxes(shape, points, part, -fronts).state - data.state).abs().mean() > 0.05
+    back = replace(shape, joints=replace(shape.joints, axis=-shape.joints.axis))
+    torch.testing.assert_close(fit_part_boxes(back, points, part, -fronts).state, -found.state)
+
+
+def test_a_body_of_which_one_side_is_seen_reaches_as_far_as_its_drawers_do_not():
+    data, shape, points, part = _views(4)
+    one_side = (part[0] != 0) | (shape.points[:, 1][(data.part == 0) | (data.rest[:, 0] > 0.28)] < 0.3)
+    assert not one_side.all()
+    found = fit_part_boxes(shape, points[:, one_side], part[:, one_side], torch.ones(2))
+    width = found.posed()[:, data.part == 0, 1].amax(dim=1) - found.posed()[:, data.part == 0, 1].amin(dim=1)
+    assert width.min() > 0.5  # of .6; the drawers are .5 wide, and what is seen of the body .3
