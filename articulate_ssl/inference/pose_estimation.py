@@ -247,7 +247,8 @@ class PoseEstimator:
                     votes = self.view_search.parts.beside(votes, dense, turn)
             rival = self._packaged(other, points, torch.zeros_like(margin))
             found = self._packaged(chosen, points, margin, votes, dense)
-            if registers and fits and dense is not None and self.front_ends.learnt:
+            square = self.object_frame.learnt and self.front_ends.learnt
+            if registers and fits and square and dense is not None:
                 category = self.articulated.category.articulated_shape(self.articulated.joint_type)
                 chosen = self.front_ends.placed(chosen, self.object_frame, category, dense, found.dense_part_id)
                 found = self._packaged(chosen, points, margin, votes, dense)
@@ -295,7 +296,7 @@ class PoseEstimator:
         """What is decided for, its rival, the margin between them, and parts of points as labelled clouds vote."""
         votes = None
         if registers and self.view_search.learnt:
-            chosen, other, margin, votes = self._seen(points, num_points)
+            chosen, other, margin, votes = self._seen(points, dense, num_points)
         elif registers and dense is not None and self.sliding.learnt:
             chosen, other, margin, votes = self._slid(points, dense, num_points)
         else:
@@ -393,17 +394,25 @@ class PoseEstimator:
     def _seen(
         self,
         points: Tensor,  # [B, N, 3]
+        dense: Tensor | None,  # [B, P, 3]
         num_points: int | None = None,
     ) -> tuple[Hypotheses, Hypotheses, Tensor, Votes]:  # H = 1, H = 1, [B]
         """The category's shape, registered from where the search among simulated views finds it, and its rival.
 
-        Which way round objects are, the search decides. With `num_points` the network's hypotheses that are turned
-        alike compete by their errors.
+        Which way round objects are, the search decides; with `num_points` by a network, if that was taught, and the
+        articulated network's hypotheses that are turned alike compete by their errors.
 
         Returns:
             Both, the margin between them, and which parts the views say that points are of.
         """
-        base, state, margin, votes = self.view_search.search(points)
+        seen = self.view_search.search(points)
+        if num_points is not None and dense is not None and self.object_frame.surface is not None:
+            turn, margin, other = self.object_frame.looked_at(dense, seen.base[:, 0, :3, :3])
+            seen, rows = seen._replace(margin=margin), other.nonzero()[:, 0]
+            if len(rows):
+                again = self.view_search.search(points[rows], turn[rows])
+                seen = seen.with_rows(rows, again._replace(margin=margin[rows]))
+        base, state, margin, votes = seen
         likelier, rival = (self.articulated.category_at(base[:, i, None], state[:, i, None]) for i in range(2))
         first, error = self.registration.registered(likelier, points)
         if num_points is None:
@@ -434,7 +443,7 @@ class PoseEstimator:
         """See `search`: by the category's own hand; and the errors [B] before proportions."""
         with torch.autocast(points.device.type, enabled=False):
             if self.view_search.learnt:
-                found, other, margin, votes = self._seen(points)
+                found, other, margin, votes = self._seen(points, dense)
                 return self._fitted(found, other, margin, points, dense, votes)
             if dense is not None and self.sliding.learnt:
                 found, _, margin, votes = self._slid(points, dense)

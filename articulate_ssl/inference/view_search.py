@@ -18,7 +18,7 @@ from torch.nn.functional import one_hot
 
 from articulate_ssl.discovery.registration import register_rigid
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
-from articulate_ssl.inference.candidates import rivals
+from articulate_ssl.inference.candidates import angle_to, rivals
 from articulate_ssl.inference.view_parts import ViewParts
 from articulate_ssl.inference.votes import Votes
 from articulate_ssl.ops.chamfer import nearest_distance, nearest_index
@@ -28,6 +28,7 @@ from articulate_ssl.ops.few_bytes import from_few_bytes, in_few_bytes
 _VIEWS, _POINTS = 1000, 256
 _COMPARED = 128  # points of each by which all are compared with a cloud
 _NEAREST = 30  # views that are registered to the cloud
+_ALIKE = 60  # views whose objects are turned about as one's, where that is known. Chosen.
 _SCALES, _ROUNDS = (0.08, 0.03), 6  # of that registration
 _VOTING = 5  # of those, with the least errors, that say which parts points are of
 _BUFFERS = ("views", "step", "part", "base", "state")
@@ -48,6 +49,16 @@ class Seen(NamedTuple):
     state: Tensor
     margin: Tensor
     votes: Votes
+
+    def with_rows(self, index: Tensor, other: Seen) -> Seen:
+        """The same, but clouds [n] as `other`, which is of these, has them, and what was said of them as rivals."""
+        base, state = (
+            own.index_copy(0, index, torch.stack([new[:, 0], own[index, 0]], dim=1))
+            for own, new in ((self.base, other.base), (self.state, other.state))
+        )
+        share = self.votes.share.index_copy(0, index, other.votes.share)
+        margin = self.margin.index_copy(0, index, other.margin)
+        return Seen(base, state, margin, Votes(self.votes.points, share))
 
 
 class ViewSearch(nn.Module):
@@ -103,16 +114,23 @@ class ViewSearch(nn.Module):
     def search(
         self,
         points: Tensor,  # [B, N, 3] depth views, farthest-point order
+        turn: Tensor | None = None,  # [B, 3, 3] canonical object space -> view
     ) -> Seen:
-        """Compare with all views, register those that are most alike, and ask the best of these."""
+        """Compare with all views, register those that are most alike, and ask the best of these.
+
+        Args:
+            turn: Only views whose objects are turned about so are compared.
+        """
         views, step, base, state = (value.to(points) for value in (self.views, self.step, self.base, self.state))
         views = from_few_bytes(views, step)
+        every = torch.arange(len(views), device=points.device)
         thin, still = views[:, :_COMPARED].contiguous(), torch.eye(3).to(points)[None]
         found, states, errors, votes = [], [], [], []
-        for cloud in points:
-            copies = cloud[:_COMPARED].expand(len(thin), -1, -1)
-            distance = nearest_distance(copies, thin).mean(dim=1) + nearest_distance(thin, copies).mean(dim=1)
-            nearest = distance.topk(min(_NEAREST, len(thin)), largest=False).indices
+        for i, cloud in enumerate(points):
+            among = every if turn is None else angle_to(base[None, :, :3, :3], turn[i, None])[0].argsort()[:_ALIKE]
+            own, copies = thin[among], cloud[:_COMPARED].expand(len(among), -1, -1)
+            distance = nearest_distance(copies, own).mean(dim=1) + nearest_distance(own, copies).mean(dim=1)
+            nearest = among[distance.topk(min(_NEAREST, len(among)), largest=False).indices]
             pose, error = register_rigid(cloud[:_POINTS], views[nearest], still, 1, _SCALES, _ROUNDS)
             pose, error = pose[:, 0], error[:, 0]
             found.append(invert_se3(pose) @ base[nearest])

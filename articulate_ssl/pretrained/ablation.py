@@ -62,6 +62,10 @@ def _no_network_of_turns(estimator: PoseEstimator) -> None:
     estimator.sliding.surface = None
 
 
+def _no_network_of_view_turns(estimator: PoseEstimator) -> None:
+    estimator.object_frame.surface = None
+
+
 def _no_network_of_parts(estimator: PoseEstimator) -> None:
     estimator.sliding.parts = None
 
@@ -92,7 +96,15 @@ ABLATIONS = (
         _no_network_of_views_parts,
     ),
     Ablation(
-        "how views are square, and that network", lambda of: of.object_frame.learnt, lambda of: of.object_frame.forget()
+        "the network that chooses among turns of views",
+        lambda of: of.object_frame.surface is not None,
+        _no_network_of_view_turns,
+    ),
+    Ablation("fronts of drawers", lambda of: of.front_ends.learnt, lambda of: of.front_ends.forget()),
+    Ablation(
+        "how views are square, and these networks",
+        lambda of: of.object_frame.learnt,
+        lambda of: of.object_frame.forget(),
     ),
     Ablation("which side is up", lambda of: bool(of.hinge_sides.learnt), _no_sides),
     Ablation("mirror images", lambda of: bool(of.handedness.learnt), lambda of: of.handedness.learnt.fill_(False)),

@@ -48,7 +48,7 @@ from articulate_ssl.training.schedule import ScheduleOptions
 from articulate_ssl.training.self_agreement import LearnConfidence, learn_confidence
 from articulate_ssl.training.set_clouds import SetClouds
 from articulate_ssl.training.test_report import TestReport
-from articulate_ssl.training.turn_lessons import learn_turns
+from articulate_ssl.training.turn_lessons import learn_turns, learn_view_turns
 from datamodules.articulated_dataset import split_labels
 
 log = logging.getLogger(__name__)
@@ -57,8 +57,8 @@ JOINT_TYPES = {"revolute": REVOLUTE, "prismatic": PRISMATIC}
 # What is learnt after the last step, in this order: each reads what those before it have learnt. Joint limits come
 # first, as what is explained beyond them must not teach, and again when it is known how faces lie: that moves states.
 LESSONS = (
-    *("first_limits", "two_ways", "turns", "objects", "handedness", "part_frames", "hinge_sides", "joint_limits"),
-    "confidence",
+    *("first_limits", "two_ways", "turns", "objects", "handedness", "part_frames", "view_turns", "hinge_sides"),
+    *("joint_limits", "confidence"),
 )
 # Terms of the loss, by the names that they are logged under.
 _LOGGED = {
@@ -90,7 +90,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             from which joint limits (`inference.state_range`) and confidence are learnt without them.
         two_ways_samples: Training clouds from which the decision between two explanations is learnt, of those that fit
             alike (`inference.two_ways`), of predictions and their rivals (`inference.surface_decision`), or of the
-            turns that a collection says (`inference.sliding_search`); 0 learns none.
+            turns that a collection says (`inference.sliding_search`) or simulated views (`inference.object_frame`); 0
+            learns none.
         object_samples: Training clouds of whole objects, each from all its clouds, whose parts are found where some
             objects' were, as those have them and as they move (`discovery.one_object.as_others`): where parts slide,
             in the multi-state setting (`discovery.grouped`), and teach a network which part points are of
@@ -234,6 +235,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             "objects": (learn_objects, self.object_samples if refines and len(self.sliding.labelled) else 0),
             "handedness": (learn_handedness, 0 if any_way else self.handedness_samples),
             "part_frames": (learn_part_frames, self.part_frames_samples if refines and (turns or views) else 0),
+            "view_turns": (learn_view_turns, self.two_ways_samples if refines and views else 0),
             "hinge_sides": (learn_hinge_sides, self.hinge_sides_samples if refines else 0),
             "joint_limits": limits,
             "confidence": (learn_confidence, calibration),
@@ -256,7 +258,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         """Adam; the category's shapes and joints are a group of their own."""
         shared = list(self.articulated.category.parameters())
         # What is learnt after the last step is not trained with the rest, nor when a run that ended goes on.
-        taught = (self.two_ways, self.hinge_sides, self.sliding, self.view_search)
+        taught = (self.two_ways, self.hinge_sides, self.sliding, self.view_search, self.object_frame)
         elsewhere = set(map(id, (*shared, *(parameter for some in taught for parameter in some.parameters()))))
         others = [p for p in self.parameters() if id(p) not in elsewhere]
         optimizer = torch.optim.Adam(

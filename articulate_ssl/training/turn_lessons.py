@@ -1,7 +1,8 @@
-"""How it is learnt which way round clouds of sliding parts are, from what the collection says of training clouds.
+"""How it is learnt which way round objects with sliding parts are, from what is said of training clouds.
 
-No label is read. `inference.sliding_search` compares a cloud with clouds of the collection; what it says of a few it
-gets wrong, and a network that sees their surface, taught by all, is right of most of these.
+No label is read. `inference.sliding_search` compares a whole cloud with clouds of the collection, and
+`inference.view_search` a depth view with simulated ones; what they say of a few they get wrong, and a network that sees
+their surface, taught by all, is right of most of these.
 """
 
 from __future__ import annotations
@@ -12,15 +13,17 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from articulate_ssl.inference.surface_decision import SurfaceDecision
 from articulate_ssl.ops.progress import announced
 from articulate_ssl.training.explanations import with_noise
+from articulate_ssl.training.line_lessons import explain
 from articulate_ssl.training.surface_lessons import learn_surface
 
 if TYPE_CHECKING:
     from articulate_ssl.training.module import ArticulatedPoseModule
 
 _BATCH = 16
-_AGREE = 0.9  # share of the clouds that it was not taught by, of which a network must say what the collection says
+_AGREE = 0.9  # share of the clouds that it was not taught by, of which a network must say what it was taught
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +38,31 @@ def learn_turns(
     sliding.surface = None  # of a run that ended and goes on
     shown = announced(log, "turns of the collection", clouds.split(_BATCH))
     frames = torch.cat([sliding.leading_turns(some.cpu())[0].mT for some in shown]).to(clouds)
+    sliding.surface = _taught(clouds, frames, torch.ones(len(clouds), dtype=torch.bool), generator)
+
+
+@torch.no_grad()
+def learn_view_turns(
+    module: ArticulatedPoseModule,
+    views: Tensor,  # [n, N, 3] farthest-point order, dense
+) -> None:
+    """Teach a network which of the turns that are square to views' frames is right, if it is known how frames lie."""
+    frame, generator = module.object_frame, torch.Generator().manual_seed(0)
+    frame.surface = None
+    if not frame.learnt:
+        return
+    explained = explain(module, views, "turns of views").base[:, 0, :3, :3]
+    batches = zip(views.split(_BATCH), explained.split(_BATCH), strict=True)
+    square, has = zip(*(frame.square(*some) for some in batches), strict=True)
+    frame.surface = _taught(views, torch.cat(square) @ frame.axes, torch.cat(has), generator)
+
+
+def _taught(
+    clouds: Tensor,  # [n, N, 3]
+    frames: Tensor,  # [n, S, 3, 3] the right one first
+    known: Tensor,  # [n] bool, which clouds teach
+    generator: torch.Generator,
+) -> SurfaceDecision | None:
     noisy = torch.cat([with_noise(some, generator) for some in clouds.split(_BATCH)])
     order = torch.randperm(len(clouds), generator=generator).to(clouds.device)
-    sliding.surface = learn_surface((clouds, noisy), frames, order, _AGREE)
+    return learn_surface((clouds, noisy), frames, order[known.to(order.device)[order]], _AGREE)
