@@ -55,6 +55,45 @@ def test_the_frame_is_learnt_from_predictions_that_are_off(learnt):
     assert along.amax(dim=0).min() > 0.995
 
 
+class _Looks(torch.nn.Module):
+    """In place of a network: what is turned as `truth` looks right, by so much."""
+
+    def __init__(self, truth: torch.Tensor, odds: float) -> None:
+        super().__init__()
+        self.truth, self.odds, self.temperature = truth, odds, torch.tensor(1.0)
+
+    def looks_right(self, frames: torch.Tensor, dense: torch.Tensor) -> torch.Tensor:
+        truth = self.truth[:, None].expand_as(frames)
+        return self.odds * (roma.rotmat_geodesic_distance(frames, truth) < 0.4).to(frames)
+
+
+def test_a_network_that_is_sure_turns_views_to_another_side(learnt):
+    data, turn = _chests(5, seed=5)
+    quarter = roma.rotvec_to_rotmat(torch.tensor([0.0, 0.0, torch.pi / 2]))
+    held = turn @ learnt.axes @ quarter @ learnt.axes.mT @ _off(1, 8.0)[0]
+    points = data.points.clone()
+    points[4] = 0.2 * torch.randn(points[4].shape, generator=torch.Generator().manual_seed(0))  # has no frame
+    frame = ObjectFrame()
+    frame.load_state_dict(learnt.state_dict())
+    nearest, has = frame.square(points, held)
+    assert nearest.shape == (5, 24, 3, 3) and has.tolist() == [True] * 4 + [False]
+    assert _degrees(nearest[:4, 0], held[:4]).max() < 20
+    frame.surface = _Looks(turn @ learnt.axes, odds=5.0)
+    found, margin, other = frame.looked_at(points, held)
+    assert other.tolist() == [True] * 4 + [False]
+    assert _degrees(found[:4], turn[:4]).max() < 20
+    assert margin[:4].min() > 0.9 and margin[4] == 0
+    frame.surface.odds = 1.0  # not sure enough: what was held to be likely stays, and nothing is sure
+    found, margin, other = frame.looked_at(points, held)
+    assert not other.any() and not margin.any()
+    torch.testing.assert_close(found[:4], nearest[:4, 0])
+    frame.surface.odds, frame.surface.truth = 5.0, held @ learnt.axes
+    found, margin, other = frame.looked_at(points, held)
+    assert not other.any() and margin[:4].min() > 0.9
+    frame.forget()
+    assert frame.surface is None
+
+
 def test_what_has_no_frame_teaches_none():
     ball = torch.nn.functional.normalize(torch.randn(8, 2048, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     turn, frame = _off(8, 70.0, seed=1), ObjectFrame()

@@ -64,6 +64,21 @@ def test_unseen_views_are_found_and_rivals_are_turned_another_way(learnt):
     assert (apart[unsure] > 30).all() and (apart[~unsure] < 1e-2).all()
 
 
+def test_where_turns_are_known_only_views_turned_so_are_asked(learnt):
+    data = _views(4, seed=6)
+    truth = data.base[:, :3, :3]
+    right, over = (learnt.search(data.points, turn) for turn in (truth, truth @ OVER))
+    assert _degrees(right.base[:, 0, :3, :3], truth).max() < 20
+    assert _degrees(over.base[:, 0, :3, :3], truth).min() > 90
+    rows = torch.tensor([1, 3])
+    mixed = right.with_rows(rows, learnt.search(data.points[rows], truth[rows] @ OVER))
+    torch.testing.assert_close(mixed.base[rows, 0], over.base[rows, 0])
+    torch.testing.assert_close(mixed.base[rows, 1], right.base[rows, 0])  # what was said before is the rival
+    torch.testing.assert_close(mixed.state[rows, 1], right.state[rows, 0])
+    torch.testing.assert_close(mixed.votes.share[rows], over.votes.share[rows])
+    assert torch.equal(mixed.base[0], right.base[0]) and torch.equal(mixed.votes.share[2], right.votes.share[2])
+
+
 def test_views_that_were_turned_over_turn_predictions_over(learnt):
     data = _views(3, seed=2)
     other = ViewSearch(2)

@@ -1,27 +1,49 @@
 """What the collection says of training clouds teaches a network; which turns it sees, and when it is not asked."""
 
 import pytest
+import roma
 import torch
+from articulated_objects import CHEST, clouds
 from tiny import POINTS, tiny_module
 
 from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.training import turn_lessons
-from articulate_ssl.training.turn_lessons import learn_turns
+from articulate_ssl.training.turn_lessons import learn_turns, learn_view_turns
 
 
 def test_the_leading_turns_are_taught_the_likeliest_as_right(monkeypatch):
     module, handed = tiny_module(joint_type="prismatic").eval(), []
-    clouds = torch.rand(20, POINTS, 3, generator=torch.Generator().manual_seed(0))
+    points = torch.rand(20, POINTS, 3, generator=torch.Generator().manual_seed(0))
     turn = torch.linalg.qr(torch.randn(20, 4, 3, 3, generator=torch.Generator().manual_seed(1))).Q
     shown = iter(turn.split(16))
     monkeypatch.setattr(module.sliding, "leading_turns", lambda some: (next(shown), torch.zeros(len(some), 4)))
     monkeypatch.setattr(turn_lessons, "learn_surface", lambda *lesson: handed.append(lesson))
-    learn_turns(module, clouds)
+    learn_turns(module, points)
     ((versions, frames, order, least),) = handed
-    assert torch.equal(versions[0], clouds) and not torch.equal(versions[1], clouds)
-    assert (versions[1] - clouds).abs().max() < 0.06
+    assert torch.equal(versions[0], points) and not torch.equal(versions[1], points)
+    assert (versions[1] - points).abs().max() < 0.06
     assert torch.equal(frames, turn.mT) and order.sort().values.tolist() == list(range(20))
     assert least == 0.9
+
+
+def test_of_the_turns_that_are_square_those_that_are_held_to_be_right_are_taught(monkeypatch):
+    module, handed = tiny_module(num_parts=3, joint_type="prismatic").eval(), []
+    frame, data = module.object_frame, clouds(CHEST, count=18, points=2048, resample=True)
+    views = data.points.clone()
+    views[17] = 0.2 * torch.randn(2048, 3, generator=torch.Generator().manual_seed(0))  # which has no frame
+    held = module.articulated.category_at(data.base[:, None], data.state[:, None])
+    monkeypatch.setattr(turn_lessons, "explain", lambda *_: held)
+    monkeypatch.setattr(turn_lessons, "learn_surface", lambda *lesson: handed.append(lesson))
+    learn_view_turns(module, views)
+    assert not handed  # it is not known how frames lie
+    frame.known.fill_(True)
+    learn_view_turns(module, views)
+    ((versions, frames, order, least),) = handed
+    assert torch.equal(versions[0], views) and least == 0.9
+    assert order.sort().values.tolist() == list(range(17))
+    assert frames.shape == (18, 24, 3, 3)
+    off = roma.rotmat_geodesic_distance(frames, data.base[:, None, :3, :3].expand_as(frames)).rad2deg()[:17]
+    assert off[:, 0].max() < 5 and off[:, 1:].min() > 80
 
 
 @pytest.mark.parametrize("options", [{}, {"orientation_range": 60.0}, {"inference": InferenceOptions(refine=False)}])
@@ -29,6 +51,6 @@ def test_nothing_is_learnt_where_no_collection_says_anything(monkeypatch, option
     module = tiny_module(joint_type="prismatic", **options)
     if options:
         module.sliding.gallery = torch.zeros(3, 8, 3)
-    clouds = type("Clouds", (), {"clouds": lambda *_: pytest.fail("asked for clouds")})()
-    module.learn_what_predictions_are_worth(clouds, ("turns",))
-    assert module.sliding.surface is None
+    shown = type("Clouds", (), {"clouds": lambda *_: pytest.fail("asked for clouds")})()
+    module.learn_what_predictions_are_worth(shown, ("turns", "view_turns"))
+    assert module.sliding.surface is None and module.object_frame.surface is None
