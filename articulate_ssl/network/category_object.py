@@ -126,6 +126,14 @@ class CategoryObject(nn.Module):
         self.assembly += displaced
 
     @torch.no_grad()
+    def turn_lines(
+        self,
+        axis: Tensor,  # [J, 3] unit
+    ) -> None:
+        """Let joints turn about these directions, through the same points."""
+        self.axis[pair_of_joints(self.chain(), self.pairs)] = axis.to(self.axis)
+
+    @torch.no_grad()
     def adopt(self, shape: ArticulatedShape) -> None:
         """Take over a discovered shape and its joints."""
         shape_points = self.template.shape[1]

@@ -1,8 +1,9 @@
 """What `inference.part_frames` and `inference.common_shape` are learnt from: predictions of training clouds.
 
-How the faces of their parts lie; then, of complete clouds, where joint lines are (`line_lessons`), and where faces say
-how clouds are turned, what they have in common. Or, where parts slide, how views are turned (`inference.object_frame`),
-which part their points are of (`view_lessons`), and which ends of parts they show (`inference.front_ends`).
+How the faces of their parts lie, or if they have none, which joints are parallel to the body (`line_lessons`); then, of
+complete clouds, where joint lines are, and where faces say how clouds are turned, what they have in common. Or, where
+parts slide, how views are turned (`inference.object_frame`), which part their points are of (`view_lessons`), and which
+ends of parts they show (`inference.front_ends`).
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from articulate_ssl.shape.fusion import fused
 from articulate_ssl.shape.object_axes import object_axes
 from articulate_ssl.shape.part_maps import PartMaps
 from articulate_ssl.training.explanations import registered_points
-from articulate_ssl.training.line_lessons import explain, learn_joint_lines
+from articulate_ssl.training.line_lessons import explain, learn_joint_axes, learn_joint_lines
 from articulate_ssl.training.view_lessons import teach_view_parts
 
 if TYPE_CHECKING:
@@ -69,8 +70,11 @@ def learn_part_frames(
     for part, (share, angle) in enumerate(quality.tolist()):
         flat = "has" if frames.flat[part] else "has no"
         tell(log, "part %d %s faces: %.0f %% of clouds alike, %.1f degrees", part, flat, 100 * share, angle)
+    turned = not frames.measured.any() and learn_joint_axes(module, explained, clouds)
     if estimator.observation.orientation.limited:
         return
+    if turned:
+        explained = explain(module, clouds, "joint axes")
     few = slice(_CLOUDS)
     explained = explained.rows(torch.arange(len(clouds), device=clouds.device)[few])
     explained = learn_joint_lines(module, explained, clouds[few])
