@@ -36,6 +36,10 @@ if TYPE_CHECKING:
 
 _BATCH = 16
 _THICKNESS = 1e-4  # in normalised units
+# Clouds that are explained with and without faces, and how much larger distances may be with them: of five sets of
+# weights that faces make better they are .97 to 1.06 times as large, of eyeglasses, whose frames only look flat, 1.31
+# (docs/experiments.md, step 192). Chosen.
+_TRIED, _WORSE = 64, 1.15
 _CLOUDS, _BEST = 128, 0.7  # that are laid over each other, and of them the share that fits best: some are turned over
 
 log = logging.getLogger(__name__)
@@ -70,6 +74,10 @@ def learn_part_frames(
     for part, (share, angle) in enumerate(quality.tolist()):
         flat = "has" if frames.flat[part] else "has no"
         tell(log, "part %d %s faces: %.0f %% of clouds alike, %.1f degrees", part, flat, 100 * share, angle)
+    if frames.learnt and not _explain_as_well(module, explained, clouds):
+        frames.flat.fill_(False)
+        frames.measured.fill_(False)
+        tell(log, "turned as faces say, shapes fit worse: they say nothing")
     turned = not frames.measured.any() and learn_joint_axes(module, explained, clouds)
     if estimator.observation.orientation.limited:
         return
@@ -80,6 +88,18 @@ def learn_part_frames(
     explained = learn_joint_lines(module, explained, clouds[few])
     if frames.learnt:
         _learn_common_shape(module, explained, clouds[few])
+
+
+def _explain_as_well(module: ArticulatedPoseModule, explained: Hypotheses, clouds: Tensor) -> bool:
+    """Whether the category's shape fits clouds that are turned as faces say about as well as where it may turn."""
+    final, frames, few = module.estimator.final, module.part_frames, clouds[:_TRIED]
+    points, one = few[:, : registered_points(module)], explained.rows(torch.arange(len(few), device=few.device))
+    faces = final.distance(final.in_proportion(one, points, few), points)
+    flat = frames.flat.clone()
+    frames.flat.fill_(False)
+    free = final.distance(final.in_proportion(one, points, few), points)
+    frames.flat.copy_(flat)
+    return bool((faces / free).median() < _WORSE)
 
 
 def _learn_object_frame(module: ArticulatedPoseModule, clouds: Tensor) -> None:

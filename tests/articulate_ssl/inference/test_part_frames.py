@@ -242,8 +242,12 @@ def test_weights_from_before_know_no_faces():
     assert set(frames.state_dict()) == {"flat", "wide", "axes", "measured", "direction"}
 
 
-def test_a_module_learns_from_what_it_predicts(monkeypatch):
-    """Its explanations, of all clouds it is given, and the category's shape for a start."""
+@pytest.mark.parametrize(("worse", "learnt"), [(1.0, True), (1.1, True), (1.3, False)])
+def test_a_module_learns_from_what_it_predicts(monkeypatch, worse, learnt):
+    """Its explanations, of all clouds it is given, and the category's shape for a start.
+
+    And nothing, if shapes fit worse by what it has learnt.
+    """
     module, data = tiny_module(), _data(count=20)
     one, asked = _explained(OVEN, data), []
 
@@ -255,9 +259,16 @@ def test_a_module_learns_from_what_it_predicts(monkeypatch):
     shape = true_shape(OVEN, data)
     monkeypatch.setattr(module.estimator, "explained", explained)
     monkeypatch.setattr(module.articulated.category, "articulated_shape", lambda kind: shape)
+    monkeypatch.setattr(
+        module.estimator.final,
+        "distance",
+        lambda _, points: torch.full((len(points),), worse if module.part_frames.learnt else 1.0),
+    )
+    monkeypatch.setattr(frame_lessons, "learn_joint_axes", lambda *_: False)
     learn_part_frames(module, data.points)
     assert asked == [16, 4]
-    assert module.part_frames.flat.tolist() == [True, True]
+    assert module.part_frames.flat.tolist() == [learnt, learnt]
+    assert learnt or not module.part_frames.measured.any()
 
 
 def test_an_estimate_with_dense_clouds_is_settled(oven, monkeypatch):
