@@ -1,11 +1,14 @@
 """A network says which part points of views are of, beside similar views; it comes with the views that taught it."""
 
+import roma
 import torch
 from articulated_objects import CHEST, clouds
 from tiny import tiny_module
 
-from articulate_ssl.geometry.se3 import transform_points
+from articulate_ssl.geometry.se3 import se3, transform_points
+from articulate_ssl.inference import view_search
 from articulate_ssl.inference.candidates import angle_to
+from articulate_ssl.inference.front_ends import FrontEnds
 from articulate_ssl.inference.view_parts import ViewParts
 from articulate_ssl.inference.view_search import ViewSearch
 from articulate_ssl.inference.votes import Votes
@@ -88,3 +91,40 @@ def test_views_that_are_square_teach_it_and_predictions_ask_it(monkeypatch):
     monkeypatch.setattr(frame_lessons, "explain", lambda *_: truth.at(truth.base.flip(0), truth.state))
     learn_part_frames(module, data.points)
     assert not module.object_frame.learnt and module.view_search.parts is None
+
+
+class _LooksRight(torch.nn.Module):
+    """In place of a network of turns: sure of those that are given."""
+
+    def __init__(self, turn: torch.Tensor) -> None:
+        super().__init__()
+        self.turn, self.temperature = turn, torch.tensor(1.0)
+
+    def looks_right(self, frames: torch.Tensor, dense: torch.Tensor) -> torch.Tensor:
+        return 9.0 * (roma.rotmat_geodesic_distance(frames, self.turn[:, None].expand_as(frames)) < 0.5).to(frames)
+
+
+def test_a_network_of_turns_overrules_the_search_and_fronts_place_drawers(monkeypatch):
+    module = tiny_module(num_parts=3, joint_type="prismatic").eval()
+    data = clouds(CHEST, count=4, points=2048, resample=True)
+    over = se3(torch.diag(torch.tensor([-1.0, -1.0, 1.0])), torch.zeros(3))
+    # Views of objects as they are, and of some that are turned another way.
+    base, part = torch.cat([data.base, data.base @ over]), data.part.expand(8, -1)
+    module.view_search.learn(data.points.repeat(2, 1, 1), base, data.state.repeat(2, 1), part)
+    module.object_frame.known.fill_(True)
+    monkeypatch.setattr(view_search, "_ALIKE", 1)
+    for truth in (data.base, data.base @ over):
+        module.object_frame.surface = _LooksRight(truth[:, :3, :3])
+        found = module.estimator.predict(data.points[:, :256], 48, refine=True, dense=data.points)
+        assert roma.rotmat_geodesic_distance(found.base_pose[:, :3, :3], truth[:, :3, :3]).rad2deg().max() < 20
+        assert (found.margin > 0.9).all()
+    module.object_frame.surface, placed = None, []
+    module.front_ends.end.fill_(1.0)
+    monkeypatch.setattr(FrontEnds, "placed", lambda self, one, frame, category, *seen: placed.append(seen) or one)
+    found = module.estimator.predict(data.points[:, :256], 48, refine=True, dense=data.points)
+    ((views, labels),) = placed
+    assert torch.equal(views, data.points) and torch.equal(labels, found.dense_part_id)
+    module.estimator.predict(data.points[:, :256], 48, refine=False, dense=data.points)
+    module.object_frame.forget()
+    module.estimator.predict(data.points[:, :256], 48, refine=True, dense=data.points)
+    assert len(placed) == 1
