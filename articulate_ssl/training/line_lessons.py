@@ -92,7 +92,10 @@ def learn_joint_axes(
     part = torch.cat([distances_to_parts(*some).argmin(-1) for some in _batches(clouds, fitted.posed()[:, 0])])
     seen, root = transform_points(invert_se3(fitted.base[:, 0]), clouds), fitted.chain.root
     bodies = [cloud[own == root] for cloud, own in zip(seen, part, strict=True)]
-    principal = torch.stack([principal_directions(body) for body in bodies if len(body) >= MIN_POINTS])
+    known = [principal_directions(body) for body in bodies if len(body) >= MIN_POINTS]
+    if not known:
+        return False
+    principal = torch.stack(known)
     axes, turned = fitted.axis[:, 0].mean(dim=0), False
     for joint, parent in enumerate(fitted.chain.parent):
         axis = functional.normalize(axes[joint], dim=0)

@@ -92,6 +92,13 @@ def test_a_round_body_says_nothing(monkeypatch):
     assert not _axes_learnt(monkeypatch, 4.5, round_body)[0]
 
 
+def test_where_no_point_is_of_the_body_nothing_is_learnt():
+    module, data = _module(), clouds(GLASSES, count=2, points=300)
+    one, legs = true_hypotheses(GLASSES, data), data.points[:, data.part != 0]
+    away = replace(one, shape=one.shape._replace(assembly=one.assembly + 9 * torch.eye(3)[:1]))
+    assert not learn_joint_axes(module, away, legs)
+
+
 def test_a_category_takes_directions_over():
     category = _module().articulated.category
     pivot = category.articulated_shape(0).joints.pivot
