@@ -1,8 +1,8 @@
 """Where parts are that slide, in depth views, as the points say that are held to be of them.
 
 A view shows the fronts of drawers and not how far they reach back, so a shape that is fitted to it may lie anywhere
-along the slides. Once it is known which part points are of, fronts say more: on development views of chests joint
-states are half as far off (docs/experiments.md, step 190). Which end of a slide is the front, predictions of training
+along the slides. Once it is known which part points are of, fronts say more: of chests joint states are a third to a
+half less far off (docs/experiments.md, steps 190 and 193). Which end of a slide is the front, predictions of training
 views say: joint states that are read there go with those that were fitted, at the other end, which is seldom seen, they
 do less. No label is read.
 """
@@ -19,12 +19,12 @@ from articulate_ssl.discovery.part_boxes import fit_part_boxes
 from articulate_ssl.geometry.se3 import se3
 from articulate_ssl.inference.late_buffers import LateBuffers
 from articulate_ssl.inference.object_frame import ObjectFrame
-from articulate_ssl.network.heads.shape import CanonicalShape
+from articulate_ssl.inference.proportions import with_instances
 from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.shape.articulated_shape import MIN_POINTS, ArticulatedShape
 
 _PARALLEL = 0.999  # cosine of a slide and an axis of the frame
-_POINTS, _CYCLES = 512, 4  # of views, and of descent: 12 cycles fit as well and lose half of what places gained
+_POINTS, _CYCLES = 512, 4  # of views, and of descent: 12 cycles lose half of what places gained (step 190)
 _GO_TOGETHER = 0.5  # correlation of what is read and what was fitted, of every joint, for ends to be learnt. Chosen.
 
 
@@ -95,19 +95,12 @@ class FrontEnds(LateBuffers):
             seen, stay = views[:, :_POINTS] @ turn @ axes, torch.ones_like(fit.state, dtype=torch.bool)
             fit.optimise(seen, _CYCLES, shared=False, bidirectional=False, known=(stay[:, 0], stay))
         found = fit.instances()
-        parts = torch.stack([found.part(k) for k in range(found.num_parts)], dim=1) @ axes.mT
-        center = parts.mean(dim=2)
-        joints = found.joints
-        structure = replace(
-            one.structure,
-            pivot=joints.pivot @ axes.mT,
-            axis=(joints.axis @ axes.mT).expand_as(one.axis),
-        )
-        new = replace(one, shape=CanonicalShape(parts - center[:, :, None], center), structure=structure)
+        lines = replace(found.joints, axis=found.joints.axis @ axes.mT, pivot=found.joints.pivot @ axes.mT)
+        new = with_instances(one, replace(found, points=found.points @ axes.mT, joints=lines))
+        new = replace(new, structure=replace(new.structure, axis=lines.axis.expand_as(one.axis)))
         place = (turn @ axes @ fit.base[:, :3, 3, None]).squeeze(-1)
         new = new.at(se3(turn, place)[:, None], fit.state[:, None])
-        enough = (part == one.chain.root).sum(dim=1) >= MIN_POINTS
-        rows = enough.nonzero()[:, 0]
+        rows = ((part == one.chain.root).sum(dim=1) >= MIN_POINTS).nonzero()[:, 0]
         return one.with_rows(rows, new.rows(rows))
 
 

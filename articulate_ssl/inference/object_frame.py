@@ -6,7 +6,8 @@ between these, is off by several degrees, as it turns one shape to objects of ot
 backs. How the frame lies in canonical object space, predictions of training views say together.
 
 Which of the 24 it is, predictions get wrong in one view of twenty, mostly by a quarter turn. A network that they taught
-sees the surface, and is wrong in one of two hundred (docs/experiments.md, step 189). No label is read.
+sees the surface; with it one development view of a hundred or less is wrong (docs/experiments.md, step 189). No label
+is read.
 """
 
 from __future__ import annotations

@@ -59,12 +59,18 @@ def fit_proportions(
         category: Every part has as many points.
     """
     fit, base = descended(one, category, points, descent)
-    instances = fit.instances()
+    return with_instances(one, fit.instances()).at((base @ fit.base)[:, None], fit.state[:, None])
+
+
+def with_instances(
+    one: Hypotheses,  # H = 1
+    instances: ArticulatedShape,  # of B clouds, in canonical object space
+) -> Hypotheses:  # H = 1
+    """Explanations with clouds' own shapes and pivots, where they were."""
     parts = torch.stack([instances.part(part) for part in range(instances.num_parts)], dim=1)
     center = parts.mean(dim=2)
     own = CanonicalShape(parts - center[:, :, None], center)
-    structure = replace(one.structure, pivot=instances.joints.pivot)
-    return replace(one, shape=own, structure=structure).at((base @ fit.base)[:, None], fit.state[:, None])
+    return replace(one, shape=own, structure=replace(one.structure, pivot=instances.joints.pivot))
 
 
 def descended(

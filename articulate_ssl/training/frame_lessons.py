@@ -106,6 +106,8 @@ def _learn_object_frame(module: ArticulatedPoseModule, clouds: Tensor) -> None:
     """How views of what slides are turned; and as that is known, which part their points are of, and where they end."""
     network, frame, search = module.articulated, module.object_frame, module.view_search
     ends = module.front_ends
+    if frame.surface is not None:
+        tell(log, "which turns look right has to be learnt anew: it was taught for other axes (lesson view_turns)")
     frame.forget()
     ends.forget()
     search.parts = None

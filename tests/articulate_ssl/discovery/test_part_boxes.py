@@ -104,7 +104,7 @@ def test_where_views_show_fronts_states_are_how_far_these_are_from_the_bodys():
     torch.testing.assert_close(fit_part_boxes(back, points, part, -fronts).state, -found.state)
 
 
-def test_a_body_of_which_one_side_is_seen_reaches_as_far_as_its_drawers_do_not():
+def test_a_body_of_which_one_side_is_seen_is_as_wide_as_the_whole_object():
     data, shape, points, part = _views(4)
     one_side = (part[0] != 0) | (shape.points[:, 1][(data.part == 0) | (data.rest[:, 0] > 0.28)] < 0.3)
     assert not one_side.all()
