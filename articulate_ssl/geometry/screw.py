@@ -7,7 +7,6 @@ Convention:
 
 from __future__ import annotations
 
-import roma
 import torch
 from torch import Tensor
 
@@ -21,8 +20,16 @@ def axis_angle_to_rotation(
     axis: Tensor,  # [..., 3], unit length
     angle: Tensor,  # [...], radians
 ) -> Tensor:  # [..., 3, 3]
-    """Rotation by `angle` about `axis`; smooth, NaN-free gradients at angle zero."""
-    return roma.rotvec_to_rotmat(axis * angle[..., None])
+    """Rotation by `angle` about `axis`, by Rodrigues' formula; smooth, NaN-free gradients at angle zero.
+
+    roma's, which takes rotation vectors, has the length of the axis to find first. Every pose of every hypothesis is
+    made here: with it, a fourth of all that a GPU was asked to do for one cloud was this function.
+    """
+    identity = torch.eye(3, dtype=axis.dtype, device=axis.device)
+    # Row i is axis x e_i; the transpose crosses the axis with a column.
+    cross = torch.linalg.cross(axis[..., None, :], identity.expand(*axis.shape, 3), dim=-1).mT
+    sine, rest = angle.sin()[..., None, None], (1 - angle.cos())[..., None, None]
+    return identity + sine * cross + rest * (cross @ cross)
 
 
 def screw_motion(

@@ -239,7 +239,7 @@ class PoseEstimator:
         with torch.autocast(points.device.type, enabled=False):
             registers = (self.inference.refine if refine is None else refine) is not False
             chosen, other, margin, votes = self._chosen(points, num_points, registers, dense)
-            error = self.final.distance(chosen, points)
+            before = self.final.distance(chosen, points) if registers and fits else None
             if registers and fits:
                 chosen, other, margin = self.final.within_limits(chosen, other, margin, points, dense)
                 if self.view_search.parts is not None and self.object_frame.learnt and dense is not None:
@@ -252,7 +252,7 @@ class PoseEstimator:
                 category = self.articulated.category.articulated_shape(self.articulated.joint_type)
                 chosen = self.front_ends.placed(chosen, self.object_frame, category, dense, found.dense_part_id)
                 found = self._packaged(chosen, points, margin, votes, dense)
-            return found, rival, error
+            return found, rival, found.reconstruction_error if before is None else before
 
     def _as_most_are(
         self,

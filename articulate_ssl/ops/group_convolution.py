@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import embedding_bag
 
+from articulate_ssl.ops.dense_group_convolution import DenseGroupConvolution, is_faster_dense
 from articulate_ssl.ops.neighborhood import Neighborhood
 from articulate_ssl.ops.precision import fast_dtype
 
@@ -29,7 +30,8 @@ def group_convolution(
         The kernel points are closed under the group, so A_g only permutes them and the correlation weights w are those
         of the unrotated kernel. Rotating the cloud by element a moves feature index g to `product[a, g]`.
 
-    The [B, M, G, C, K] aggregate is never held whole: it is built tile by tile, and again in the backward pass.
+    The [B, M, G, C, K] aggregate is never held whole: it is built tile by tile, and again in the backward pass. On a
+    GPU, large ones are not built from gathered features (`dense_group_convolution.py`).
     Gradients reach `features` and `weight`; the geometry is constant. Under autocast the products run, and the result
     is, in the autocast type where the device multiplies it faster than float32.
     """
@@ -39,7 +41,9 @@ def group_convolution(
         weight, neighborhood = weight.to(dtype), neighborhood.to(dtype)
         if features is None:
             return _constant_input(neighborhood, weight, permutation)
-        return _GroupConvolution.apply(features.to(dtype), weight, neighborhood.index, neighborhood.weight, permutation)
+        features, correlation = features.to(dtype), neighborhood.weight
+        function = DenseGroupConvolution if is_faster_dense(features, correlation) else _GroupConvolution
+        return function.apply(features, weight, neighborhood.index, correlation, permutation)
 
 
 def _constant_input(neighborhood: Neighborhood, weight: Tensor, permutation: Tensor) -> Tensor:

@@ -19,5 +19,5 @@ def object_axes(
     """
     first = functional.normalize(shape.joints.axis[0], dim=0)
     across = torch.linalg.svd(first[None]).Vh[1:]  # [2, 3] at right angles to it
-    turn = oriented_bounds_2D((shape.part(shape.joints.chain.root) @ across.T).double().numpy())[0][:2, :2]
+    turn = oriented_bounds_2D((shape.part(shape.joints.chain.root) @ across.T).double().cpu().numpy())[0][:2, :2]
     return torch.cat([first[None], torch.from_numpy(turn).to(across) @ across]).T

@@ -22,7 +22,7 @@ def assert_same_as_twin(
     results = []
     for function in (fast, twin):
         out = function()
-        direction = torch.linspace(-1, 1, out.numel(), dtype=out.dtype).view_as(out)
+        direction = torch.linspace(-1, 1, out.numel(), dtype=out.dtype, device=out.device).view_as(out)
         results.append((out, *torch.autograd.grad(out, inputs, direction)))
     for a, b in zip(*results, strict=True):
         assert relative_error(a, b) < tolerance

@@ -7,7 +7,7 @@ from twins import TOLERANCE, assert_same_as_twin, relative_error
 from articulate_ssl.geometry.equivariance import Permutation, Vector, assert_equivariant
 from articulate_ssl.geometry.kernel_points import symmetric_kernel_points
 from articulate_ssl.geometry.rotation_group import rotation_group
-from articulate_ssl.ops import reference
+from articulate_ssl.ops import dense_group_convolution, reference
 from articulate_ssl.ops.group_convolution import _TILE_ELEMENTS, group_convolution
 from articulate_ssl.ops.neighborhood import build_neighborhood
 
@@ -44,6 +44,26 @@ def test_the_tiling_does_not_change_the_result(monkeypatch, budget):
     _, kernel, points, features, weight, centers = _problem()
     neighborhood = build_neighborhood(points, 0.2, kernel.points, 16, centers)
     _assert_equal_to_reference((features, weight), neighborhood, kernel.permutation, 1e-9, features)
+
+
+@pytest.mark.parametrize("budget", [1, 10**9])
+@pytest.mark.parametrize("dtype", TOLERANCE)
+def test_without_gathering_it_is_the_same(monkeypatch, dtype, budget):
+    monkeypatch.setitem(dense_group_convolution._LEAST_GATHERED, "cpu", 0)
+    monkeypatch.setitem(dense_group_convolution._BLOCK_ELEMENTS, "cpu", budget)
+    _, kernel, points, features, weight, centers = _problem(60, dtype)
+    points[:, 1] = points[:, 0]  # coincident
+    neighborhood = build_neighborhood(points, 0.2, kernel.points, 16, centers)
+    assert dense_group_convolution.is_faster_dense(features, neighborhood.weight)
+    _assert_equal_to_reference((features, weight), neighborhood, kernel.permutation, TOLERANCE[dtype], features)
+
+
+def test_many_points_are_gathered(monkeypatch):
+    monkeypatch.setitem(dense_group_convolution._LEAST_GATHERED, "cpu", 0)
+    few, many = torch.empty(1, 64, 12, 3), torch.empty(1, 2000, 12, 3)
+    correlation = torch.empty(1, 64, 16, 24)
+    assert dense_group_convolution.is_faster_dense(few, correlation)
+    assert not dense_group_convolution.is_faster_dense(many, correlation)
 
 
 def test_constant_input_equals_features_of_one():
