@@ -1,9 +1,9 @@
 """Group convolution on a GPU: every point is a neighbour, most of them of weight zero, so that none is gathered.
 
 A GPU multiplies matrices far faster than it copies rows of features to where they are multiplied: at the paper's size
-(512 points, of which 64 are neighbours) gathering took 61 % of a prediction on an H200, and eight times as many products
-take less (docs/benchmarks.md). The sum over neighbours is a product with the correlation weights of all points, and its
-gradient one with their transpose: nothing is scattered either.
+(512 points, of which 64 are neighbours) gathering took 61 % of a prediction on an H200, and eight times as many
+products take less (docs/benchmarks.md). The sum over neighbours is a product with the correlation weights of all
+points, and its gradient one with their transpose: nothing is scattered either.
 """
 
 from __future__ import annotations
@@ -15,7 +15,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 _MOST_POINTS = 16  # per neighbour: with more, the products take longer than the copies
-_LEAST_GATHERED = {"cpu": 2**62, "cuda": 2**23}  # features of one sample; with fewer, starting kernels is all that counts
+_LEAST_GATHERED = {
+    "cpu": 2**62,
+    "cuda": 2**23,
+}  # features of one sample; with fewer, starting kernels is all that counts
 _BLOCK_ELEMENTS = {"cpu": 2**19, "cuda": 2**28}  # of the aggregate that is held at a time
 
 
@@ -23,7 +26,7 @@ def is_faster_dense(features: Tensor, correlation: Tensor) -> bool:
     """Whether `DenseGroupConvolution` is the faster of the two: on a GPU, for large but not too many features."""
     _, N, G, C = features.shape
     _, M, n, _ = correlation.shape
-    return N <= _MOST_POINTS * n and M * n * G * C >= _LEAST_GATHERED[features.device.type]
+    return _MOST_POINTS * n >= N and M * n * G * C >= _LEAST_GATHERED[features.device.type]
 
 
 class DenseGroupConvolution(torch.autograd.Function):
@@ -81,7 +84,7 @@ def _kernel(weight: Tensor, permutation: Tensor) -> Tensor:  # [G, K C, C']
 def _blocks(features: Tensor, index: Tensor, correlation: Tensor) -> Iterator[tuple[slice, Tensor]]:
     """Some samples at a time, with the weights [b, M K, N] of all points for their centres."""
     B, N, G, C = features.shape
-    _, M, n, K = correlation.shape
+    M, K = correlation.shape[1], correlation.shape[3]
     size = max(1, _BLOCK_ELEMENTS[features.device.type] // (G * M * K * C))
     for start in range(0, B, size):
         samples = slice(start, min(start + size, B))

@@ -11,8 +11,9 @@ from articulate_ssl.geometry.equivariance import Permutation, Vector, assert_equ
 from articulate_ssl.geometry.kernel_points import symmetric_kernel_points
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.network.backbone import EquivariantBackbone
-from articulate_ssl.ops import reference
+from articulate_ssl.ops import dense_group_convolution, reference
 from articulate_ssl.ops.chamfer import chamfer, hypothesis_distances, nearest_index
+from articulate_ssl.ops.dense_group_convolution import is_faster_dense
 from articulate_ssl.ops.direction_convolution import direction_convolution
 from articulate_ssl.ops.group_convolution import group_convolution
 from articulate_ssl.ops.neighborhood import build_neighborhood
@@ -42,6 +43,25 @@ def _neighborhood(kernel):
     return build_neighborhood(points, 0.2, kernel.points, 16, torch.arange(20, device="cuda").expand(2, -1))
 
 
+def test_at_the_papers_size_nothing_is_gathered_and_all_is_the_same(monkeypatch):
+    kernel = symmetric_kernel_points(GROUP, 24)
+    points = 0.15 * _drawn(2, 512, 3, seed=1)
+    neighborhood = build_neighborhood(points.float(), 0.16, kernel.points, 64)
+    features, weight = (_drawn(*shape).float().requires_grad_() for shape in ((2, 512, 60, 64), (24, 64, 32)))
+    assert is_faster_dense(features, neighborhood.weight)
+    results = []
+    for gathers in (False, True):
+        monkeypatch.setitem(dense_group_convolution._LEAST_GATHERED, "cuda", 2**62 if gathers else 0)
+        for kind in (torch.float32, torch.bfloat16):
+            with torch.autocast("cuda", torch.bfloat16, enabled=kind == torch.bfloat16):
+                out = group_convolution(features, neighborhood, weight, kernel.permutation.cuda())
+            assert out.dtype == kind
+            results.append((out, *torch.autograd.grad(out, (features, weight), torch.ones_like(out))))
+    exact = results[2]
+    for found, tolerance in ((results[0], 2e-3), (results[1], 2e-2), (results[3], 2e-2)):
+        assert all(relative_error(a.float(), b) < tolerance for a, b in zip(found, exact, strict=True))
+
+
 @pytest.mark.parametrize("separable", [False, True])
 def test_group_convolutions_equal_their_twins(separable):
     kernel = symmetric_kernel_points(GROUP, 24)
@@ -62,9 +82,7 @@ def test_group_convolutions_equal_their_twins(separable):
 def test_the_direction_convolution_equals_its_twin():
     kernel = symmetric_kernel_points(GROUP, 13)
     orbit = kernel_orbits(icosahedron_directions(GROUP), kernel).cuda()
-    inputs = [
-        _drawn(*shape, requires_grad=True) for shape in ((2, 40, 12, 5), (int(orbit.max()) + 1, 5), (5, 7))
-    ]
+    inputs = [_drawn(*shape, requires_grad=True) for shape in ((2, 40, 12, 5), (int(orbit.max()) + 1, 5), (5, 7))]
     features, spatial, mixing = inputs
     arguments = (features, _neighborhood(kernel), spatial, mixing, orbit)
     assert_same_as_twin(
