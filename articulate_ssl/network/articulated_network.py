@@ -120,12 +120,13 @@ class ArticulatedNetwork(nn.Module):
         """Part proposal [B, C, K], and features [B, K, G, 2D] of the parts beside those of the whole."""
         with torch.autocast(points.device.type, torch.bfloat16, enabled=self.mixed_precision):
             features = self.backbone(points)
-        features = features.to(points.dtype)
+            invariant = self.point_pool(features).to(points.dtype)
         centers = points[:, : features.shape[1]] - mean
-        logits = self.part_proposal(self.point_pool(features)).to(points.dtype)
+        logits = self.part_proposal(invariant).to(points.dtype)
         ones = centers.new_ones(*centers.shape[:2], 1)
         association = torch.cat([logits.softmax(dim=-1), ones], dim=-1)
-        pooled = self.pointnet(features, centers, association).to(points.dtype)
+        with torch.autocast(points.device.type, torch.bfloat16, enabled=self.mixed_precision):
+            pooled = self.pointnet(features, centers, association).to(points.dtype)
         whole = pooled[:, -1:].expand(-1, self.num_parts, -1, -1)
         parts = pooled[:, :-1] if self.part_features else whole
         return logits, torch.cat([parts, whole], dim=-1)

@@ -41,8 +41,10 @@ class SO3PointNet(nn.Module):
         first, norm, _, last, _ = self.perceptron
         of_features, of_points = first.weight.split([features.shape[-1], 3], dim=1)
         # A_g^T x is linear in x: all group elements at once, and neither concatenation nor its gradient.
-        seen = torch.einsum("gij,dj->igd", self.elements.to(of_points), of_points)
-        hidden = (points.to(of_points) @ seen.flatten(1)).view(-1, len(first.bias)) + first.bias
+        # In mixed precision, products of features are rounded, and coordinates are not.
+        with torch.autocast(points.device.type, enabled=False):
+            seen = torch.einsum("gij,dj->igd", self.elements.to(of_points), of_points)
+            hidden = (points.to(of_points) @ seen.flatten(1)).view(-1, len(first.bias)) + first.bias
         hidden = hidden + features.flatten(0, 2) @ of_features.T
         hidden = layer_norm_leaky_relu(hidden, norm.weight, norm.bias, _SLOPE, norm.eps)
         hidden = last(hidden).view(*features.shape[:-1], -1)
@@ -74,7 +76,8 @@ class DirectionPointNet(nn.Module):
         association: Tensor,  # [B, M, K], how much each point belongs to each part
     ) -> Tensor:  # [B, K, G, C']
         """Pool points into parts as `SO3PointNet` does, and order the directions."""
-        along = points @ self.vectors.to(points).T  # [B, M, V]
+        with torch.autocast(points.device.type, enabled=False):
+            along = points @ self.vectors.to(points).T  # [B, M, V]
         away = points.norm(dim=-1, keepdim=True).expand_as(along)
         first, norm, _, last, _ = self.perceptron
         hidden = first(torch.cat([features, torch.stack([along, away], dim=-1)], dim=-1))
