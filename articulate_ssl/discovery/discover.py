@@ -7,7 +7,8 @@
    piece to every aligned cloud on its own; `joint_fit` reduces the motion between them to joints; from there labels,
    joints and each cloud's proportions descend together (`instance_fit`), the better ones for longer (`selection`). The
    winner reconstructs best with joints and proportions, which is what a wrong split cannot do. So far every typical
-   cloud is on its own; the one stays whose shape explains all clouds best, and by its joints (`joint_gain`).
+   cloud is on its own; of those that agree about the collection (`agreement`) the one stays whose shape explains all
+   clouds best, and by its joints (`joint_gain`).
 3. *Rounds*: register the articulated shape to every cloud again (`registrar`; from many orientations, which is what
    rights clouds that the rigid template fitted upside down), then descend again on the clouds that fit.
 
@@ -22,6 +23,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
+from articulate_ssl.discovery.agreement import agreeing
 from articulate_ssl.discovery.bodies import fit_bodies
 from articulate_ssl.discovery.collection import Collection
 from articulate_ssl.discovery.instance_fit import InstanceFit
@@ -88,7 +90,7 @@ def _best_reference(scenes: Iterator[Scene], few: Tensor, registrar: Registrar, 
             f"{num_parts} parts that move on their own; check the category's number of parts, or allow more starts"
         )
     _announce(2 * options.references, options, "which template explains most")
-    return best_by_joints(candidates, few, options)
+    return best_by_joints(agreeing(candidates, few), few, options)
 
 
 def split(scene: Scene) -> RegisteredShape | None:
