@@ -15,10 +15,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 _MOST_POINTS = 16  # per neighbour: with more, the products take longer than the copies
-_LEAST_GATHERED = {
-    "cpu": 2**62,
-    "cuda": 2**23,
-}  # features of one sample; with fewer, starting kernels is all that counts
+# Features that one sample gathers: with fewer, starting kernels is all that counts on a GPU. Never on a CPU.
+_LEAST_GATHERED = {"cpu": 2**62, "cuda": 2**23}
 _BLOCK_ELEMENTS = {"cpu": 2**19, "cuda": 2**28}  # of the aggregate that is held at a time
 
 

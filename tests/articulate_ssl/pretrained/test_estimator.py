@@ -96,8 +96,9 @@ def test_a_batch_goes_through_together_and_is_predicted_as_one_by_one(folder, cl
 
 def test_the_answer_is_in_the_unit_of_the_scan(folder, cloud):
     estimator = load(folder / "trained.ckpt")
-    small, large = estimator.predict(cloud), estimator.predict(cloud * 1000)
-    np.testing.assert_allclose(large.parts[0].pose[:3, 3], small.parts[0].pose[:3, 3] * 1000, rtol=1e-3, atol=5)
+    # A power of two, which rounds nothing: descent amplifies rounding.
+    small, large = estimator.predict(cloud), estimator.predict(cloud * 1024)
+    np.testing.assert_allclose(large.parts[0].pose[:3, 3], small.parts[0].pose[:3, 3] * 1024, rtol=1e-3)
     assert large.relative_error == pytest.approx(small.relative_error, rel=1e-3)
 
 
