@@ -44,8 +44,9 @@ def test_objects_of_other_proportions_are_fitted_by_stretching():
     assert (state - data.state).abs().mean() < 0.06
     axis = (base[:, :3, :3] @ joints.axis[0], data.base[:, :3, :3] @ data.axis[0])
     assert torch.cosine_similarity(*axis).abs().min() > 0.98
+    stretched = fit.error(data.points)
     fit._stretch.zero_()
-    assert (fit.error(data.points) > 1.2 * fit.error(data.points).min()).any()
+    assert fit.error(data.points).mean() > 1.06 * stretched.mean()  # 1.12 seen
 
 
 def test_labels_are_found_from_a_coarse_start():
