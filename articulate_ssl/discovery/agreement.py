@@ -56,8 +56,15 @@ def agreement(
     other: Tensor,  # [n, N]
     num_parts: int,
 ) -> float:
-    """Share of the points of the same part, with parts named alike in the way that makes it largest."""
-    both = torch.bincount(num_parts * one.flatten() + other.flatten(), minlength=num_parts**2)
-    same = both.view(num_parts, num_parts)
-    rows, columns = linear_sum_assignment(-same.cpu().numpy())
-    return float(same[rows, columns].sum() / one.numel())
+    """Share of the points that are of the same part, whatever it is called."""
+    return float((renaming(one, other, num_parts)[one] == other).float().mean())
+
+
+def renaming(
+    one: Tensor,  # parts of points, of any shape
+    other: Tensor,  # of the same points
+    num_parts: int,
+) -> Tensor:  # [K] int64
+    """What `other` calls the parts of `one`, each another name, so that most points are called alike."""
+    both = torch.bincount((num_parts * one + other).flatten(), minlength=num_parts**2).view(num_parts, num_parts)
+    return torch.from_numpy(linear_sum_assignment(both.cpu().numpy(), maximize=True)[1]).to(one.device)

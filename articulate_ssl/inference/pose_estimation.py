@@ -239,8 +239,9 @@ class PoseEstimator:
         with torch.autocast(points.device.type, enabled=False):
             registers = (self.inference.refine if refine is None else refine) is not False
             chosen, other, margin, votes = self._chosen(points, num_points, registers, dense)
-            before = self.final.distance(chosen, points) if registers and fits else None
+            before = None
             if registers and fits:
+                before = self.final.distance(chosen, points)
                 chosen, other, margin = self.final.within_limits(chosen, other, margin, points, dense)
                 if self.view_search.parts is not None and self.object_frame.learnt and dense is not None:
                     turn = (chosen.base[:, 0, :3, :3] @ self.object_frame.axes).mT

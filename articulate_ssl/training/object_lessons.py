@@ -15,9 +15,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
-from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
+from articulate_ssl.discovery.agreement import renaming
 from articulate_ssl.discovery.discover import DiscoveryError
 from articulate_ssl.discovery.named_alike import ObjectParts, named_alike
 from articulate_ssl.discovery.one_object.find import MIN_CLOUDS
@@ -70,6 +70,4 @@ def _named_alike(found: Sequence[LabelledClouds], chain: KinematicChain) -> Labe
     before = [one.part.long() for one in found]
     objects = [ObjectParts(one.points, part, chain.root) for one, part in zip(found, before, strict=True)]
     part = torch.cat([name[one] for name, one in zip(named_alike(objects, count), before, strict=True)])
-    agree = torch.bincount((part * count + torch.cat(before)).flatten(), minlength=count**2).view(count, count)
-    own = torch.from_numpy(linear_sum_assignment(-agree.numpy())[1])
-    return LabelledClouds(torch.cat([one.points for one in found]), own[part])
+    return LabelledClouds(torch.cat([one.points for one in found]), renaming(part, torch.cat(before), count)[part])

@@ -10,6 +10,12 @@ from tiny import POINTS, tiny_module
 from articulate_ssl.training.checkpoint import load_module
 from articulate_ssl.training.shipped_weights import WEIGHTS_FOLDER
 
+SHIPPED = ("drawer-complete", "drawer-depth", "laptop-complete", "safe-complete", "safe-depth")
+LEARNT = (
+    *("two_ways", "sliding", "view_search", "handedness", "hinge_sides"),
+    *("part_frames", "common_shape", "object_frame", "front_ends"),
+)
+
 
 def test_the_pretence_refuses_what_a_gpu_refuses():
     with pretended_gpu():
@@ -37,8 +43,17 @@ def test_predictions_of_a_new_module(recipe):
     torch.testing.assert_close(found.part_pose, expected.part_pose, atol=1e-4, rtol=0)
 
 
-# Between them, these decide and register by everything that there is.
-@pytest.mark.parametrize("name", ["drawer-complete", "drawer-depth", "safe-complete", "laptop-depth"])
+def test_between_them_they_have_learnt_everything_that_decides():
+    learnt = set()
+    for name in SHIPPED:
+        estimator = load_module(WEIGHTS_FOLDER / f"{name}.safetensors").estimator
+        learnt |= {part for part in LEARNT if getattr(estimator, part).learnt}
+        learnt |= {"surface"} if estimator.object_frame.surface is not None else set()
+        learnt |= {"parts"} if estimator.view_search.parts is not None else set()
+    assert learnt == {*LEARNT, "surface", "parts"}
+
+
+@pytest.mark.parametrize("name", SHIPPED)
 def test_predictions_of_shipped_weights(name):
     module = load_module(WEIGHTS_FOLDER / f"{name}.safetensors")
     generator = torch.Generator().manual_seed(0)
