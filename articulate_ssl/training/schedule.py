@@ -14,7 +14,7 @@ class ScheduleOptions:
         rigid_steps: Steps of stage 0, rigid alignment of the whole shape, before the articulated network trains.
         warmup_steps: Steps on registered clouds alone, with the category's shapes and joints held (staged recipe).
         learning_rate: Of Adam.
-        decay: The learning rate is multiplied by this every `decay_every` steps (paper recipe).
+        decay: The learning rate is multiplied by this every `decay_every` steps after stage 0 (paper recipe).
         decay_every: See above.
         final_rate: Share of the learning rate that is left at the end of its cosine (staged recipe).
         balanced_share: Share of the articulated network's steps in which the clouds of a batch are spread evenly over

@@ -72,8 +72,11 @@ class TrainingRecipe(Recipe):
         return Outcome.of(trained)
 
     def network_rate(self, step: int) -> float:
-        """Multiplied by `decay` every `decay_every` steps."""
-        return self.schedule.decay ** (step // self.schedule.decay_every)
+        """Multiplied by `decay` every `decay_every` steps of the articulated network; stage 0 keeps the initial one.
+
+        Where stage 0 decayed, too, it stopped learning long before its end (docs/experiments.md, step 201).
+        """
+        return self.schedule.decay ** (max(0, step - self.schedule.rigid_steps) // self.schedule.decay_every)
 
     def category_rate(self, step: int) -> float:
         """Faster than the networks."""

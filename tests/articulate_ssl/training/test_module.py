@@ -289,6 +289,8 @@ def test_options_that_make_no_sense_are_refused():
 def test_the_paper_recipe_decays_in_steps_and_the_staged_one_holds_the_category_during_warmup():
     paper, staged = tiny_module(recipe="paper"), tiny_module(rigid_steps=2, warmup_steps=3, steps=10)
     assert [paper.recipe.network_rate(s) for s in (0, 1, 2, 4)] == [1, 1, 0.7, 0.7**2]
+    aligned_first = tiny_module(recipe="paper", rigid_steps=5, steps=10)
+    assert [aligned_first.recipe.network_rate(s) for s in (0, 4, 6, 7)] == [1, 1, 1, 0.7]
     assert [staged.recipe.category_rate(s) > 0 for s in (0, 4, 5)] == [False, False, True]
     assert staged.recipe.network_rate(0) == 1 and staged.recipe.network_rate(10) == pytest.approx(0.02)
 
