@@ -74,7 +74,7 @@ class TrainingRecipe(Recipe):
     def network_rate(self, step: int) -> float:
         """Multiplied by `decay` every `decay_every` steps of the articulated network; stage 0 keeps the initial one.
 
-        Where stage 0 decayed, too, it stopped learning long before its end (docs/experiments.md, step 201).
+        With that decay stage 0 of ovens stood still after 3,000 steps (docs/experiments.md, step 201).
         """
         return self.schedule.decay ** (max(0, step - self.schedule.rigid_steps) // self.schedule.decay_every)
 
