@@ -75,7 +75,8 @@ def _compare(category: str, names: tuple[str, ...], args: argparse.Namespace) ->
             _say(f"{file}: kept")
 
     keep(*jobs)
-    if missing := [job for job in jobs if not (job.finished or measured.knows(job))]:
+    missing = [job for job in jobs if not (job.finished or measured.knows(job))]
+    if missing and not args.show:
         try:
             make_data(setting, tuple(job.learner for job in missing), _say)
         except StageFailed as error:
@@ -119,6 +120,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--data-options", type=shlex.split, default=[], help="words for the generator, as one argument")
     add("--workers", type=int, default=1, help="jobs at once on this machine; default: 1")
     add("--measured", type=Path, help="folder of results to keep, and to take instead of measuring them again")
+    add("--show", action="store_true", help="make tables of what is finished or kept, and run nothing")
     add("--scheduler", help="address of a Dask scheduler (tcp://…) to spread jobs over machines instead")
     return parser
 

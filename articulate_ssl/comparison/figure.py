@@ -65,7 +65,7 @@ def draw(results: Results, path: str | os.PathLike) -> None:
     figure.suptitle(
         f"{results.setting.title}, by what methods are given\n"
         f"{results.samples} clouds of {results.instances} unseen objects, {seeds}, "
-        "95 % intervals",
+        f"95 % intervals{', ticks are seeds' * (max(counts) > 1)}",
         color=_INK,
         fontsize="medium",
     )
@@ -81,4 +81,7 @@ def _mark(axes: Axes, y: float, result: RowResult, quantity: str, factor: float)
     if value.low is not None:
         # A logarithmic axis has no place for what is below zero.
         axes.plot([max(factor * value.low, 1e-3), factor * value.high], [y, y], color=colour, linewidth=1.6, alpha=0.6)
+    if len(value.of_seeds) > 1:
+        each = [max(factor * mean, 1e-3) for mean in value.of_seeds]
+        axes.plot(each, [y] * len(each), "|", color=colour, markersize=8)
     axes.plot([max(factor * value.mean, 1e-3)], [y], "o", color=colour, markersize=5)

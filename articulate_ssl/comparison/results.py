@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -16,11 +17,13 @@ from articulate_ssl.comparison.measured import Measured
 from articulate_ssl.comparison.rows import Row, rows_of
 from articulate_ssl.comparison.statistics import Estimate, combined
 from articulate_ssl.geometry.screw import REVOLUTE
-from articulate_ssl.metrics.report import MULTI_STATE
+from articulate_ssl.metrics.report import MULTI_STATE, PERCENT
 from articulate_ssl.metrics.report import rows as statistics_of
 from articulate_ssl.training.columns import NETWORK
 
 ALL = "all"  # parts or joints on average
+
+_LARGEST = 1.0  # share
 
 _NO_REPORT = {"part_names": (), "samples": 0, "instances": 0, "calibration": {"joint_type": ()}}
 # Of our rows, the one that does what the paper's own does.
@@ -109,7 +112,11 @@ def _row_result(row: Row, seeds: tuple[int, ...], reports: list[dict[str, Any]],
     if any(report.get("setting") == MULTI_STATE for report in reports):
         row = replace(row, given=(*row.given, _OBJECTS))
     each = [{(quantity, of): value for quantity, of, value in statistics_of(report)} for report in reports]
-    values = {key: combined([one[key] for one in each]) for key in each[0] if key[0] in row.quantities}
+    values = {
+        key: combined([one[key] for one in each], _LARGEST if key[0] in PERCENT else math.inf)
+        for key in each[0]
+        if key[0] in row.quantities
+    }
     return RowResult(
         row,
         seeds,

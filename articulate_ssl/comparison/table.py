@@ -68,6 +68,16 @@ def as_markdown(results: Results) -> str:
             [_legacy(result) for result in results.rows],
         ),
     ]
+    if repeated := [result for result in results.rows if len(result.seeds) > 1]:
+        lines += [
+            "",
+            "Each training by itself, in the order of the seeds: how much it is chance.",
+            "",
+            *_grid(
+                ["method", *(heading for heading, *_ in UNFOLDED)],
+                [_each_seed(row, results.revolute) for row in repeated],
+            ),
+        ]
     if results.failed:
         lines += ["", "Not finished:", "", *(f"- {reason}" for reason in results.failed)]
     return "\n".join(lines) + "\n"
@@ -77,15 +87,16 @@ def as_csv(results: Results) -> str:
     """One line per row, quantity and part or joint."""
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["method", "given", "quantity", "of", "mean", "ci95_low", "ci95_high", "seeds"])
+    writer.writerow(["method", "given", "quantity", "of", "mean", "ci95_low", "ci95_high", "seeds", "of_seeds"])
     for result in results.rows:
         about = (result.row.name, given(result))
         seeds = " ".join(map(str, result.seeds))
         for (quantity, of), value in result.values.items():
-            writer.writerow([*about, quantity, of, *value, seeds])
+            means = " ".join(map(str, value.of_seeds))
+            writer.writerow([*about, quantity, of, value.mean, value.low, value.high, seeds, means])
         for name in ("train_seconds", "seconds_per_cloud", "parameters"):
             if (number := getattr(result, name)) is not None:
-                writer.writerow([*about, name, ALL, number, None, None, seeds])
+                writer.writerow([*about, name, ALL, number, None, None, seeds, None])
     return text.getvalue()
 
 
@@ -114,16 +125,29 @@ def as_json(results: Results) -> str:
 
 
 def _unfolded(result: RowResult, revolute: bool) -> list[str]:
-    numbers = [
-        _with_interval(result.value(quantity), quantity, (1 if revolute else 3) if digits is None else digits)
-        for _, quantity, digits in UNFOLDED
-    ]
+    numbers = [_with_interval(result.value(quantity), quantity, digits) for quantity, digits in _quantities(revolute)]
     about = (
         NOTHING if result.train_seconds is None else f"{result.train_seconds:.0f}",
         NOTHING if result.seconds_per_cloud is None else f"{result.seconds_per_cloud:.3f}",
         NOTHING if result.parameters is None else f"{result.parameters:,}".replace(",", " "),
     )
     return [result.row.title, given(result), str(len(result.seeds)), *numbers, *about]
+
+
+def _each_seed(result: RowResult, revolute: bool) -> list[str]:
+    values = [(result.value(quantity), quantity, digits) for quantity, digits in _quantities(revolute)]
+    return [
+        result.row.title,
+        *(
+            NOTHING if value is None else " / ".join(_number(mean, quantity, digits) for mean in value.of_seeds)
+            for value, quantity, digits in values
+        ),
+    ]
+
+
+def _quantities(revolute: bool) -> list[tuple[str, int]]:
+    """Of the unfolded table, with the digits of each."""
+    return [(quantity, (1 if revolute else 3) if digits is None else digits) for _, quantity, digits in UNFOLDED]
 
 
 def _legacy(result: RowResult) -> list[str]:

@@ -75,15 +75,22 @@ def _setting(tmp_path, view="complete", **options) -> Setting:
 
 
 def test_seeds_and_objects_are_both_in_the_interval():
-    assert combined([_statistic(4.0, 1.0)]) == Estimate(4.0, 3.0, 5.0)
+    assert combined([_statistic(4.0, 1.0)]) == Estimate(4.0, 3.0, 5.0, (4.0,))
     several = combined([_statistic(3.0, 1.0), _statistic(4.0, 1.0), _statistic(5.0, 1.0)])
     seeds = 4.302653 * 1.0 / math.sqrt(3)  # Student's 97.5 % quantile of two degrees of freedom
     assert several.mean == 4.0
     assert several.high - 4.0 == pytest.approx(math.hypot(1.0, seeds), rel=1e-6)
     # Seeds that agree leave the objects' interval as it is: the objects are the same.
-    assert combined([_statistic(4.0, 1.0)] * 3) == Estimate(4.0, 3.0, 5.0)
-    assert combined([_statistic(4.0, None)] * 2) == Estimate(4.0, None, None)
+    assert combined([_statistic(4.0, 1.0)] * 3) == Estimate(4.0, 3.0, 5.0, (4.0,) * 3)
+    assert combined([_statistic(4.0, None)] * 2) == Estimate(4.0, None, None, (4.0,) * 2)
     assert combined([_statistic(4.0), {"mean": None, "median": None, "ci95": None}]) is None
+
+
+def test_no_interval_reaches_beyond_what_is_possible():
+    far_apart = [_statistic(0.28, 0.01), _statistic(0.97, 0.01), _statistic(0.28, 0.01)]
+    assert combined(far_apart).high > 1  # of an error nothing forbids it
+    share = combined(far_apart, largest=1.0)
+    assert (share.low, share.high, share.of_seeds) == (0.0, 1.0, (0.28, 0.97, 0.28))
 
 
 def test_every_learner_has_rows_with_names_of_their_own():
@@ -177,10 +184,11 @@ def test_the_tables_hold_what_the_reports_and_the_paper_say(tmp_path, programs, 
     assert command.main([*options, "--methods", "oracle_icp"]) == 0
     text = (build / "laptop-complete.md").read_text()
     assert text in capsys.readouterr().out
-    unfolded, legacy = (line for line in text.splitlines() if line.startswith("| Oracle ICP"))
+    unfolded, legacy, each = (line for line in text.splitlines() if line.startswith("| Oracle ICP"))
     # Seeds 4.0 and 5.0, each with 1.0 over objects: Student's quantile of one degree of freedom is 12.7.
     half = math.hypot(1.0, 12.7062 * math.sqrt(0.5) / math.sqrt(2))
-    assert f"| 4.5 [{4.5 - half:.1f}, {4.5 + half:.1f}] |" in unfolded
+    assert f"| 4.5 [0.0, {4.5 + half:.1f}] |" in unfolded
+    assert each.startswith("| Oracle ICP | 4.0 / 5.0 |")
     assert "clouds, part labels, part poses, parts at test | 2 |" in unfolded
     assert unfolded.endswith("| 60 | 0.500 | 12 345 |")
     assert unfolded.count("–") == 3  # axis, pivot, state: ICP predicts no joints
@@ -188,6 +196,7 @@ def test_the_tables_hold_what_the_reports_and_the_paper_say(tmp_path, programs, 
     with (build / "laptop-complete.csv").open() as file:
         rows = {(row["quantity"], row["of"]): row for row in csv.DictReader(file)}
     assert float(rows["r_err_deg", "lid"]["mean"]) == 5.5 and rows["r_err_deg", "lid"]["seeds"] == "0 1"
+    assert rows["r_err_deg", "lid"]["of_seeds"] == "5.0 6.0"
     (row,) = json.loads((build / "laptop-complete.json").read_text())["rows"]
     assert row["printed"]["seg_miou"] == 56.2 and row["parameters"] == 12345
     assert matplotlib.image.imread(build / "laptop-complete.png").std() > 0
@@ -238,6 +247,19 @@ def test_results_that_are_kept_are_not_measured_again(tmp_path, programs, capsys
     capsys.readouterr()
     assert command.main([*elsewhere, "--seeds", "2"]) == 2
     assert "op_align-0.json" in capsys.readouterr().err
+
+
+def test_what_there_is_can_be_shown_before_all_is_finished(tmp_path, programs):
+    (tmp_path / "data" / "laptop" / "procedural-complete").mkdir(parents=True)
+    (tmp_path / "data" / "laptop" / "procedural-complete" / "manifest.json").touch()
+    options = ["--root", str(tmp_path / "data"), "--build", str(tmp_path / "build"), "--methods", "oracle_icp"]
+    assert command.main(options) == 0
+    count = len(programs.commands)
+    assert command.main([*options, "op_align", "--seeds", "3", "--show"]) == 0
+    assert len(programs.commands) == count
+    text = (tmp_path / "build" / "laptop-complete.md").read_text()
+    oracle, other = (line for line in text.splitlines() if line.startswith(("| Oracle ICP | c", "| OP-Align | c")))
+    assert "| 1 | 4.0 [3.0, 5.0] |" in oracle and "| 0 | – | – |" in other
 
 
 def test_of_a_recipe_all_ways_to_predict_are_kept(tmp_path, monkeypatch):
