@@ -23,7 +23,8 @@ from articulate_ssl.training.columns import NETWORK
 
 ALL = "all"  # parts or joints on average
 
-_LARGEST = 1.0  # share
+# What intervals end at, of shares and angles.
+_LARGEST = {**dict.fromkeys(PERCENT, 1.0), **dict.fromkeys(("r_err_deg", "r_err_sym_deg", "axis_err_deg"), 180.0)}
 
 _NO_REPORT = {"part_names": (), "samples": 0, "instances": 0, "calibration": {"joint_type": ()}}
 # Of our rows, the one that does what the paper's own does.
@@ -113,7 +114,7 @@ def _row_result(row: Row, seeds: tuple[int, ...], reports: list[dict[str, Any]],
         row = replace(row, given=(*row.given, _OBJECTS))
     each = [{(quantity, of): value for quantity, of, value in statistics_of(report)} for report in reports]
     values = {
-        key: combined([one[key] for one in each], _LARGEST if key[0] in PERCENT else math.inf)
+        key: combined([one[key] for one in each], _LARGEST.get(key[0], math.inf))
         for key in each[0]
         if key[0] in row.quantities
     }
