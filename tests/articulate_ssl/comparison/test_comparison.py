@@ -86,11 +86,18 @@ def test_seeds_and_objects_are_both_in_the_interval():
     assert combined([_statistic(4.0), {"mean": None, "median": None, "ci95": None}]) is None
 
 
-def test_no_interval_reaches_beyond_what_is_possible():
+def test_no_interval_reaches_beyond_what_is_possible(tmp_path, monkeypatch):
     far_apart = [_statistic(0.28, 0.01), _statistic(0.97, 0.01), _statistic(0.28, 0.01)]
     assert combined(far_apart).high > 1  # of an error nothing forbids it
     share = combined(far_apart, largest=1.0)
     assert (share.low, share.high, share.of_seeds) == (0.0, 1.0, (0.28, 0.97, 0.28))
+    monkeypatch.setattr(Job, "finished", True)
+    ious = {"seg_miou": _statistic(0.28, 0.01)}, {"seg_miou": _statistic(0.97, 0.01)}
+    monkeypatch.setattr(Job, "report", lambda job, _column: _report(170.0 * job.seed) | ious[job.seed])
+    (row,) = collect(_setting(tmp_path), ["oracle_icp"], [0, 1], []).rows
+    assert row.value("r_err_deg").of_seeds == (4.0, 174.0)
+    assert (row.value("r_err_deg").low, row.value("r_err_deg").high) == (0.0, 180.0)
+    assert (row.value("seg_miou").low, row.value("seg_miou").high) == (0.0, 1.0)
 
 
 def test_every_learner_has_rows_with_names_of_their_own():
