@@ -74,7 +74,7 @@ class TrainingRecipe(Recipe):
     def network_rate(self, step: int) -> float:
         """Multiplied by `decay` every `decay_every` steps of the articulated network; stage 0 keeps the initial one.
 
-        With that decay, too, 4,000 steps of stage 0 end at a larger loss (ovens, one seed; docs/experiments.md, step 201).
+        With that decay 4,000 steps of stage 0 end at a larger loss (ovens, one seed; docs/experiments.md, step 201).
         """
         return self.schedule.decay ** (max(0, step - self.schedule.rigid_steps) // self.schedule.decay_every)
 
