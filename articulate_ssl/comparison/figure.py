@@ -8,13 +8,19 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from articulate_ssl.baselines.method import DENSE_CLOUDS, OCCUPANCY, TEST_PARTS
-from articulate_ssl.comparison.results import Results, RowResult
+from articulate_ssl.comparison.results import OBJECTS, SCANS, Results, RowResult
 from datamodules.atomic import atomic_write
 
 _WIDTH, _ROW, _FRAME = 10.0, 0.27, 1.7  # inches: of the picture, of a row, and of all that is no row
 _INK, _OURS, _OTHERS, _BAND = "#222222", "#c44e52", "#4c72b0", "#f1f1f1"
 # From what asks for least to what asks for most.
-LEVELS = ("clouds only", "and occupancy", "and labels in training", "and parts of the test cloud")
+LEVELS = (
+    "clouds only",
+    "and which clouds show one object",
+    "and occupancy",
+    "and labels in training",
+    "and parts of the test cloud",
+)
 _LEAST, _MOST = 0.5, 180.0  # degrees of the logarithmic axis; what is better than the least looks the same
 
 
@@ -22,10 +28,10 @@ def level(result: RowResult) -> int:
     """Index into `LEVELS` of the most that a row's method is given."""
     words = set(result.row.given)
     if TEST_PARTS in words:
+        return 4
+    if words - {OCCUPANCY, DENSE_CLOUDS, OBJECTS, SCANS}:
         return 3
-    if words - {OCCUPANCY, DENSE_CLOUDS}:
-        return 2
-    return 1 if OCCUPANCY in words else 0
+    return 2 if OCCUPANCY in words else 1 if OBJECTS in words else 0
 
 
 def draw(results: Results, path: str | os.PathLike) -> None:

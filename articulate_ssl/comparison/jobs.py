@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,20 +16,30 @@ from typing import Any
 import yaml
 
 from articulate_ssl.baselines import METHODS
-from articulate_ssl.comparison.rows import needs_occupancy
+from articulate_ssl.comparison.rows import MULTI_STATE, needs_occupancy, recipe_of
 from articulate_ssl.metrics.report import JSON_NAME
 from articulate_ssl.pretrained.pack import PROFILES, VIEW_OF_DATA, fit_command, generate_arguments, newest_metrics
-from articulate_ssl.pretrained.rebuild import COMPLETE_OPTIONS, DEPTH_OPTIONS, resumed
+from articulate_ssl.pretrained.rebuild import (
+    COMPLETE_OPTIONS,
+    DEPTH_OPTIONS,
+    MULTI_STATE_OPTIONS,
+    SCANS_OPTIONS,
+    resumed,
+)
 from articulate_ssl.pretrained.stages import Stage, Workplace
 from articulate_ssl.training.checkpoint import load_module
 from datamodules.manifest import MANIFEST_NAME, Manifest, ManifestError, set_folder
 from datamodules.occupancy import FOLDER, INDEX_NAME
 
 DATA_SEED = 21  # no other: shipped weights and their check are of 11 and 12, README's numbers of 1 to 4
+# Of the objects that multi-state trainings know in ten states each: others, so that none of them is tested on.
+SCANS_SEED = 22
+_SCANS = "scans"  # folder of their set, and its stage
 OCCUPANCY_SAMPLES = 2048  # of each training cloud
 # Configuration files of recipes that need their own, behind the category's and the profile.
 RECIPE_CONFIGS = {"paper": (Path("configs/profiles/paper_recipe.yaml"),)}
 _SOURCE = "procedural"  # of the set that trains
+_NO_TEST = ("--test-instances", "1")  # of scans, of which nothing is tested; the last option of a name counts
 SAMPLES = 300  # test clouds; chosen: Oracle ICP takes two seconds for each
 
 
@@ -89,6 +99,16 @@ class Setting:
         return set_folder(self.root, self.category, _SOURCE, self.view, self.protocol)
 
     @property
+    def scans_root(self) -> Path:
+        """Where objects lie that multi-state trainings know in several states."""
+        return self.folder / _SCANS
+
+    @property
+    def scans(self) -> Path:
+        """Folder of their set, of complete clouds."""
+        return set_folder(self.scans_root, self.category, _SOURCE, "complete", None)
+
+    @property
     def test_set(self) -> Path:
         """Folder of the set that is tested on."""
         if self.test_source is None:
@@ -109,7 +129,7 @@ class Setting:
 
 
 def make_data(setting: Setting, learners: tuple[str, ...], say: Callable[[str], None]) -> None:
-    """Make the set, and the occupancy samples that some method needs, if they are not there.
+    """Make the set, the occupancy samples and the scans that some learners need, if they are not there.
 
     Raises:
         StageFailed: if the generator fails.
@@ -120,6 +140,10 @@ def make_data(setting: Setting, learners: tuple[str, ...], say: Callable[[str], 
             f"{setting.test_set}: no data set here. Make it with: make data CAT={setting.category} VIEW={setting.view} "
             f"SOURCE={setting.test_source} ROOT=<folder of the objects> OUT={setting.test_root or setting.root}"
         )
+    if MULTI_STATE in learners and not (setting.scans / MANIFEST_NAME).is_file():
+        options = (*(MULTI_STATE_OPTIONS if setting.view == "complete" else SCANS_OPTIONS), *_NO_TEST)
+        words = ("--category", setting.category, "--view", "complete", "--seed", str(SCANS_SEED), *options)
+        _generate(setting, _SCANS, words, setting.scans_root, say)
     folder = setting.training_set
     occupancy = needs_occupancy(learners)
     if (folder / MANIFEST_NAME).is_file():
@@ -131,17 +155,21 @@ def make_data(setting: Setting, learners: tuple[str, ...], say: Callable[[str], 
         words += DEPTH_OPTIONS if setting.view == "partial" else COMPLETE_OPTIONS
         words += setting.data_options
     words += ["--occupancy", str(OCCUPANCY_SAMPLES)] if occupancy else []
-    command = (sys.executable, "-m", "render.generate", *words, "--out", str(setting.root), "--workers", "1")
-    Workplace(f"{setting.name}: data", setting.folder / "data").run(Stage("data", command), say)
+    _generate(setting, "data", words, setting.root, say)
+
+
+def _generate(setting: Setting, name: str, words: Sequence[str], out: Path, say: Callable[[str], None]) -> None:
+    command = (sys.executable, "-m", "render.generate", *words, "--out", str(out), "--workers", "1")
+    Workplace(f"{setting.name}: {name}", setting.folder / "data").run(Stage(name, command), say)
 
 
 @dataclass(frozen=True)
 class Job:
-    """The training and test of one method or recipe with one seed.
+    """The training and test of one learner with one seed.
 
     Attributes:
         setting: Category, view and effort.
-        learner: Name of the method or recipe.
+        learner: Its name, of `rows.learners`.
         seed: Of the training.
     """
 
@@ -221,15 +249,21 @@ class Job:
         return Stage("method", command), Stage(self._other_test, (*command, *other))
 
     def _recipe_stages(self) -> tuple[Stage, ...]:
-        setting = self.setting
-        _, fit, *learn = fit_command(setting.category, VIEW_OF_DATA[setting.view], self.seed)
+        setting, told = self.setting, self.learner == MULTI_STATE
+        _, fit, *learn = fit_command(setting.category, VIEW_OF_DATA[setting.view], self.seed, told)
+        if "--data.scans" in learn:
+            learn[learn.index("--data.scans") + 1] = str(setting.scans)
         configs = (*RECIPE_CONFIGS.get(self.learner, ()), *setting.configs)
         learn += [word for file in configs for word in ("-c", str(file))]
-        learn += ["--model.recipe", self.learner, "--data.root", str(setting.root), "--data.seed", str(self.seed)]
+        # Of complete clouds, scans take the place of the table's training clouds; of views, they are beside them.
+        scans_alone = told and setting.view == "complete"
+        root = setting.scans_root if scans_alone else setting.root
+        learn += ["--model.recipe", recipe_of(self.learner), "--data.root", str(root), "--data.seed", str(self.seed)]
         learn += ["--data.max_test_samples", str(setting.samples), "--trainer.enable_progress_bar", "false"]
         learn += ["--trainer.default_root_dir", str(self._run)]
         ours = (sys.executable, "-m", "articulate_ssl.cli")
         columns = ("--model.inference.columns", "true")
+        columns += ("--data.root", str(setting.root)) if scans_alone else ()
         stages = (Stage("fit", (*ours, fit, *learn)), Stage("test", (*ours, "test", *learn, *columns)))
         if setting.test_source is None:
             return stages

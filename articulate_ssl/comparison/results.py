@@ -14,10 +14,11 @@ import yaml
 
 from articulate_ssl.comparison.jobs import Job, Setting
 from articulate_ssl.comparison.measured import Measured
-from articulate_ssl.comparison.rows import Row, rows_of
+from articulate_ssl.comparison.rows import MULTI_STATE, Row, rows_of
 from articulate_ssl.comparison.statistics import Estimate, combined
 from articulate_ssl.geometry.screw import REVOLUTE
-from articulate_ssl.metrics.report import MULTI_STATE, PERCENT
+from articulate_ssl.metrics.report import MULTI_STATE as MULTI_STATE_SETTING
+from articulate_ssl.metrics.report import PERCENT
 from articulate_ssl.metrics.report import rows as statistics_of
 from articulate_ssl.training.columns import NETWORK
 
@@ -29,7 +30,8 @@ _LARGEST = {**dict.fromkeys(PERCENT, 1.0), **dict.fromkeys(("r_err_deg", "r_err_
 _NO_REPORT = {"part_names": (), "samples": 0, "instances": 0, "calibration": {"joint_type": ()}}
 # Of our rows, the one that does what the paper's own does.
 _PAPERS_OWN = ("paper", f"paper_{NETWORK}")
-_OBJECTS = "which clouds show one object"  # given in training, where that is the multi-state setting
+# Given in training in the multi-state setting, and where views are taught by scans.
+OBJECTS, SCANS = "which clouds show one object", "complete scans of other objects"
 
 
 @dataclass(frozen=True)
@@ -110,8 +112,9 @@ def _row_result(row: Row, seeds: tuple[int, ...], reports: list[dict[str, Any]],
     printed = _printed(row, setting)
     if not reports:
         return RowResult(row, printed=printed)
-    if any(report.get("setting") == MULTI_STATE for report in reports):
-        row = replace(row, given=(*row.given, _OBJECTS))
+    if any(report.get("setting") == MULTI_STATE_SETTING for report in reports):  # configurations can say so, too
+        scans = (SCANS,) if row.learner == MULTI_STATE and setting.view == "partial" else ()
+        row = replace(row, given=(*row.given, OBJECTS, *scans))
     each = [{(quantity, of): value for quantity, of, value in statistics_of(report)} for report in reports]
     values = {
         key: combined([one[key] for one in each], _LARGEST.get(key[0], math.inf))

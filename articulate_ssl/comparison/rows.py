@@ -12,6 +12,7 @@ from datamodules.manifest import VIEWS
 
 # Recipes whose shape comes from their network: without it, there is nothing to search for.
 LEARN_THE_SHAPE = ("paper",)
+MULTI_STATE = "multi_state"  # our `staged` recipe in that setting
 # Which quantities of a report each word of `Method.says` stands for.
 QUANTITIES = {
     SEGMENTATION: ("seg_miou", "legacy_seg_miou"),
@@ -31,7 +32,7 @@ class Row:
     Attributes:
         name: In files.
         title: In the table.
-        learner: Name of the method or recipe that is trained for it; several rows may share one.
+        learner: Name of what is trained for it, of `learners`; several rows may share one.
         given: What that reads beyond clouds; see `Method.given`.
         quantities: What of the report is its own.
         views: Of which views it is defined.
@@ -48,23 +49,28 @@ class Row:
 
 
 def learners() -> tuple[str, ...]:
-    """Names of all that can be trained and compared: methods, then recipes."""
-    return (*METHODS, *RECIPES)
+    """Names of all that can be trained and compared: methods, recipes, and the multi-state setting."""
+    return (*METHODS, *RECIPES, MULTI_STATE)
+
+
+def recipe_of(learner: str) -> str | None:
+    """The recipe that a learner is trained by; None for a method."""
+    return "staged" if learner == MULTI_STATE else learner if learner in RECIPES else None
 
 
 def rows_of(learner: str) -> list[Row]:
     """The rows that one training is for.
 
     Raises:
-        ValueError: if there is no such method or recipe.
+        ValueError: if there is no such learner.
     """
-    if learner in RECIPES:
+    if recipe_of(learner) is not None:
         columns = (NETWORK, REGISTERED) if learner in LEARN_THE_SHAPE else (NO_NETWORK, NETWORK, REGISTERED)
         everything = tuple(quantity for said in (SEGMENTATION, POSES, JOINT_LINES) for quantity in QUANTITIES[said])
         return [
             Row(
                 f"{learner}_{column}",
-                f"ours, {learner}: {TITLES[column]}",
+                f"ours, {learner.replace('_', '-')}: {TITLES[column]}",
                 learner,
                 # What decides between two explanations after registration reads all points (`inference/two_ways.py`).
                 (DENSE_CLOUDS,) if column == REGISTERED else (),

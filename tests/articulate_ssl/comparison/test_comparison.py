@@ -16,7 +16,7 @@ from articulate_ssl.comparison import jobs as jobs_module
 from articulate_ssl.comparison.jobs import Job, Setting, make_data
 from articulate_ssl.comparison.measured import Measured
 from articulate_ssl.comparison.results import Results, RowResult, collect
-from articulate_ssl.comparison.rows import QUANTITIES, Row, learners, rows_of
+from articulate_ssl.comparison.rows import MULTI_STATE, QUANTITIES, Row, learners, rows_of
 from articulate_ssl.comparison.spread import do_jobs
 from articulate_ssl.comparison.statistics import Estimate, combined
 from articulate_ssl.comparison.table import as_markdown
@@ -103,8 +103,9 @@ def test_no_interval_reaches_beyond_what_is_possible(tmp_path, monkeypatch):
 def test_every_learner_has_rows_with_names_of_their_own():
     rows = [row for name in learners() for row in rows_of(name)]
     assert len({row.name for row in rows}) == len({row.title for row in rows}) == len(rows)
-    assert {row.learner for row in rows} == {*METHODS, *RECIPES}
+    assert {row.learner for row in rows} == {*METHODS, *RECIPES, MULTI_STATE}
     assert [row.column for row in rows_of("staged")] == ["no_network", "network", "network_registered"]
+    assert [row.column for row in rows_of(MULTI_STATE)] == ["no_network", "network", "network_registered"]
     assert [row.column for row in rows_of("paper")] == ["network", "network_registered"]
     with pytest.raises(ValueError, match="npcs_epn"):
         rows_of("magic")
@@ -134,6 +135,38 @@ def test_commands_are_those_that_the_programs_take(tmp_path):
     assert other_test.command[: len(same[1].command)] == same[1].command
     fit, _ = Job(_setting(tmp_path, configs=(Path("more.yaml"),)), "paper", 1).stages()
     assert "-c configs/profiles/paper_recipe.yaml -c more.yaml --model.recipe paper" in " ".join(fit.command)
+
+
+def _value(command, option: str) -> str:
+    """What counts of an option that is given several times: the last."""
+    words = list(command)
+    return words[len(words) - words[::-1].index(option)]
+
+
+@pytest.mark.parametrize("view", ["complete", "partial"])
+def test_the_multi_state_setting_learns_from_other_objects_and_is_tested_on_the_same(tmp_path, programs, view):
+    setting = _setting(tmp_path, view)
+    fit, test = Job(setting, MULTI_STATE, 1).stages()
+    _, single = Job(setting, "staged", 1).stages()
+    assert _value(test.command, "--data.root") == _value(single.command, "--data.root") == str(setting.root)
+    assert _value(fit.command, "--model.recipe") == "staged"
+    profile = {"complete": "multi_state", "partial": "depth_from_scans"}[view]
+    assert f"configs/profiles/{profile}.yaml" in fit.command
+    if view == "complete":
+        assert _value(fit.command, "--data.root") == str(setting.scans_root)
+    else:
+        assert _value(fit.command, "--data.scans") == _value(test.command, "--data.scans") == str(setting.scans)
+        assert _value(fit.command, "--data.root") == str(setting.root)
+
+    make_data(setting, ("staged",), print)
+    assert len(programs.commands) == 1
+    programs.commands.clear()
+    make_data(setting, (MULTI_STATE,), print)
+    scans, views = programs.commands
+    assert _value(scans, "--out") == str(setting.scans_root)
+    assert _value(scans, "--view") == "complete"
+    assert _value(scans, "--seed") != _value(views, "--seed")
+    assert int(_value(scans, "--states")) >= 8
 
 
 def test_data_are_made_once_and_occupancy_is_added_only_if_needed(tmp_path, programs, synthetic_set, monkeypatch):
@@ -296,6 +329,9 @@ def test_a_row_says_if_it_was_given_which_clouds_show_one_object(tmp_path, monke
     text = as_markdown(collect(_setting(tmp_path, "complete"), ["staged"], [0], []))
     row = next(line for line in text.splitlines() if line.startswith("| ours, staged"))
     assert f"| {given}" in row and ("one object" in row) == bool(more)
+    views = as_markdown(collect(_setting(tmp_path, "partial"), ["staged", MULTI_STATE], [0], []))
+    of_views = [line for line in views.splitlines() if line.startswith("| ours")]
+    assert ["complete scans" in line for line in of_views[:6]] == [False] * 3 + [bool(more)] * 3
 
 
 def test_failures_and_bad_names_are_exit_codes(tmp_path, programs, capsys):
