@@ -1,10 +1,11 @@
-"""`articulate-ssl weights list|show|pack|rebuild|teach|check|ablate`: the weights that come with the package."""
+"""`articulate-ssl weights list|show|pack|rebuild|teach|check|ablate|columns`: weights that come with the package."""
 
 from __future__ import annotations
 
 import argparse
 import shlex
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 from rich.console import Console
@@ -45,7 +46,7 @@ def run(arguments: list[str]) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="articulate-ssl weights", description="Weights that come with the package.")
-    commands = parser.add_subparsers(required=True, metavar="list|show|pack|rebuild|teach|check|ablate")
+    commands = parser.add_subparsers(required=True, metavar="list|show|pack|rebuild|teach|check|ablate|columns")
     listed = commands.add_parser("list", help="which there are, and what they are worth")
     listed.add_argument("--markdown", choices=list(VIEWS), metavar="VIEW", help="README's table of one view instead")
     listed.set_defaults(do=_list)
@@ -83,12 +84,16 @@ def _parser() -> argparse.ArgumentParser:
     check.set_defaults(do=_check)
 
     ablate = commands.add_parser("ablate", help="what is lost without each thing that was learnt after training")
-    ablate.add_argument("names", nargs="+", help="categories or names")
-    ablate.add_argument("--seed", type=int, default=_ABLATION_SEED, help=f"of the data (default: {_ABLATION_SEED})")
-    samples = f"test clouds at most (default: {_ABLATION_SAMPLES})"
-    ablate.add_argument("--samples", type=int, default=_ABLATION_SAMPLES, help=samples)
-    ablate.add_argument("--build", type=Path, default=_ABLATIONS, help=f"for data and results (default: {_ABLATIONS})")
     ablate.set_defaults(do=_ablate)
+    columns = commands.add_parser("columns", help="no network, the network alone, and both: the same clouds")
+    columns.set_defaults(do=_columns)
+    for study in (ablate, columns):
+        study.add_argument("names", nargs="+", help="categories or names")
+        study.add_argument("--seed", type=int, default=_ABLATION_SEED, help=f"of the data (default: {_ABLATION_SEED})")
+        samples = f"test clouds at most (default: {_ABLATION_SAMPLES})"
+        study.add_argument("--samples", type=int, default=_ABLATION_SAMPLES, help=samples)
+        place = f"for data and results (default: {_ABLATIONS})"
+        study.add_argument("--build", type=Path, default=_ABLATIONS, help=place)
     return parser
 
 
@@ -187,9 +192,21 @@ def _check(args: argparse.Namespace) -> int:
 def _ablate(args: argparse.Namespace) -> int:
     from articulate_ssl.pretrained.ablation import Study, as_markdown
 
+    return _study(args, Study.run, as_markdown)
+
+
+def _columns(args: argparse.Namespace) -> int:
+    from articulate_ssl.pretrained.ablation import Study, columns_as_markdown
+
+    return _study(args, Study.columns, columns_as_markdown)
+
+
+def _study(args: argparse.Namespace, work: Callable, as_table: Callable) -> int:
+    from articulate_ssl.pretrained.ablation import Study
+
     for weights in [weights for name in args.names for weights in _named(name)]:
-        found = Study(weights, args.seed, args.samples, args.build).run(_say)
-        print(f"\n{weights.name}, data seed {args.seed}, {found[0][1]['samples']} clouds\n\n{as_markdown(found)}")
+        found = work(Study(weights, args.seed, args.samples, args.build), _say)
+        print(f"\n{weights.name}, data seed {args.seed}, {found[0][1]['samples']} clouds\n\n{as_table(found)}")
     return 0
 
 

@@ -2,14 +2,15 @@
 
 Nothing is trained anew. Of weights that are loaded again one thing is left out, the rest stays as it was learnt with
 it, and what is predicted is calibrated and tested as ever. So a row says what is lost if one thing goes, not what
-would be learnt without it. Objects are of a data seed of their own: those of the card are for the card.
+would be learnt without it. Or it is the network that goes, or registration (`training.columns`). Objects are of a data
+seed of their own: those of the card are for the card.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ from articulate_ssl.pretrained.check import data_of, make_data, tested
 from articulate_ssl.pretrained.fingerprint import fingerprint
 from articulate_ssl.pretrained.markdown_table import cells_of, table_of
 from articulate_ssl.training.checkpoint import load_module
+from articulate_ssl.training.columns import SECONDS, TITLES
+from articulate_ssl.training.module import ArticulatedPoseModule
 from articulate_ssl.training.shipped_weights import ShippedWeights
 from articulate_ssl.training.weights_card import CARD_SUFFIX, WeightsCard
 from datamodules.atomic import atomic_write
@@ -139,32 +142,65 @@ class Study:
         Raises:
             CheckpointError: if the weights have no card, the seed is the card's own, or no data can be made.
         """
+        card, place = self._with_data(say)
+        estimator = load_module(self.weights.file).estimator
+        found = []
+        for ablation in (one for one in ABLATIONS if one.known(estimator)):
+            say(f"{self.weights.name}: without {ablation.name} …")
+            metrics = self._tested(f"without {ablation.name}", _without(ablation), card, place)
+            found.append((ablation.name, metrics))
+        return found
+
+    def columns(self, say: Callable[[str], None]) -> list[tuple[str, dict[str, Any]]]:
+        """What predicts, as `lightning test --model.inference.columns true` names it, and its metrics.
+
+        Raises:
+            CheckpointError: as `run`.
+        """
+        card, place = self._with_data(say)
+        say(f"{self.weights.name}: no network, network alone, both …")
+        metrics = self._tested("columns", _in_columns, card, place)
+        return [(TITLES[name], column) for name, column in metrics["columns"].items()]
+
+    def _with_data(self, say: Callable[[str], None]) -> tuple[WeightsCard, Path]:
         card = WeightsCard.load(self.weights.file.with_suffix(CARD_SUFFIX))
         place = self.build / f"{self.weights.name}-seed-{self.seed}"
         if not (place / "made").is_file():
             say(f"{self.weights.name}: data of seed {self.seed} …")
             make_data(card, self.seed, place)
             (place / "made").touch()
-        first = load_module(self.weights.file)
-        found = []
-        for ablation in (one for one in ABLATIONS if one.known(first.estimator)):
-            say(f"{self.weights.name}: without {ablation.name} …")
-            found.append((ablation.name, self._without(ablation, card, place)))
-        return found
+        return card, place
 
-    def _without(self, ablation: Ablation, card: WeightsCard, place: Path) -> dict[str, Any]:
+    def _tested(
+        self, name: str, change: Callable[[ArticulatedPoseModule], None], card: WeightsCard, place: Path
+    ) -> dict[str, Any]:
+        """The content of `metrics.json` of weights that something was changed of, unless it is known."""
         about = fingerprint(self.weights.file, self.samples)
-        note = place / f"without {ablation.name}.json"
+        note = place / f"{name}.json"
         if note.is_file() and (known := json.loads(note.read_text()))["of"] == about:
             return known["metrics"]
         module = load_module(self.weights.file)
-        ablation.forget(module.estimator)
+        change(module)
         metrics = tested(module, data_of(card, place / "data", module.num_points, self.samples), place)
         with atomic_write(note) as file:
             file.write(json.dumps({"of": about, "metrics": metrics}).encode())
         return metrics
 
 
+def _without(ablation: Ablation) -> Callable[[ArticulatedPoseModule], None]:
+    return lambda module: ablation.forget(module.estimator)
+
+
+def _in_columns(module: ArticulatedPoseModule) -> None:
+    module.inference = replace(module.inference, columns=True)
+
+
 def as_markdown(found: Sequence[tuple[str, dict[str, Any]]]) -> str:
     """A table, a row for each thing that was left out."""
     return table_of("without", [[name, *cells_of(metrics)] for name, metrics in found])
+
+
+def columns_as_markdown(found: Sequence[tuple[str, dict[str, Any]]]) -> str:
+    """A table, a row for each way to predict, with its seconds for a cloud."""
+    rows = [[name, *cells_of(metrics), f"{metrics[SECONDS]:.2f}"] for name, metrics in found]
+    return table_of("what predicts", rows, "s / cloud")

@@ -9,7 +9,7 @@ from packable import shipped_in, trained
 from synthetic import write_synthetic_set
 
 from articulate_ssl.pretrained import ablation as module
-from articulate_ssl.pretrained.ablation import ABLATIONS, NOTHING, Study, as_markdown
+from articulate_ssl.pretrained.ablation import ABLATIONS, NOTHING, Study, as_markdown, columns_as_markdown
 from articulate_ssl.training.checkpoint import load_module
 from articulate_ssl.training.shipped_weights import ShippedWeights, shipped_weights
 
@@ -50,6 +50,26 @@ def test_what_weights_have_is_left_out_one_after_the_other_and_once(shipped, tmp
     assert len({line.count("|") for line in lines}) == 1
     Study(shipped, 57, 4, tmp_path / "build").run(said.append)
     assert len(known) == 6
+
+
+def test_what_the_network_is_worth_and_registration_is_asked_of_the_same_clouds(shipped, tmp_path, monkeypatch):
+    made = []
+
+    def data(_, seed: int, place: Path) -> None:
+        made.append(seed)
+        write_synthetic_set(place / "data")
+
+    monkeypatch.setattr(module, "make_data", data)
+    study = Study(shipped, 57, 6, tmp_path / "build")
+    found = study.columns(print)
+    assert [name for name, _ in found] == ["no network", "network alone", "network, registered"]
+    assert all(metrics["samples"] == 6 for _, metrics in found)
+    assert len({metrics["r_err_deg"]["mean"] for _, metrics in found}) == 3
+    assert json.dumps(study.columns(print)) == json.dumps(found)  # the time that it took, too: nothing is run again
+    assert json.dumps(study.run(print)[0][1]["r_err_deg"]) == json.dumps(found[-1][1]["r_err_deg"])
+    assert made == [57]
+    lines = columns_as_markdown(found).splitlines()
+    assert lines[0].endswith("| s / cloud |") and len({line.count("|") for line in lines}) == 1
 
 
 @pytest.mark.parametrize("ablation", ABLATIONS[1:], ids=lambda one: one.name)
