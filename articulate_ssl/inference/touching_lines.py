@@ -23,16 +23,24 @@ from articulate_ssl.ops.chamfer import nearest_distance
 _REACH, _STEP = 0.2, 0.01  # lines are looked for so far away, on a grid
 _NEAREST = 8  # points of a part that say how near it is to a line
 _AS_NEAR = 0.003  # where parts are hardly farther from a line, the one that is moved least is taken
-_WORTH = 0.02  # a line stays unless both parts together come nearer by so much: in other objects they are as far
+# A line stays unless both parts together come nearer by so much: in other objects they are as far. Views show one side
+# of a hinge; what came nearer by less there was moved for better or worse (docs/experiments.md, steps 160 and 204).
+_WORTH, _WORTH_IN_VIEWS = 0.02, 0.03
 
 
 def shifts_to_touch(
     one: Hypotheses,  # H = 1, of n clouds, whose joints turn
     clouds: Tensor,  # [n, P, 3] dense
+    views: bool = False,
 ) -> tuple[Tensor, Tensor]:  # [J, 3], [J, 2]
     """How far joint lines are to be moved, in canonical object space, so that both of their parts are near them.
 
     Which part a point is of, explanations say by which part is nearest.
+
+    Args:
+        one: Explanations.
+        clouds: What they are of.
+        views: Whether clouds are depth views.
 
     Returns:
         That, 0 where lines stay; and how far the parts of each joint are from its line, together, before and after, in
@@ -47,7 +55,7 @@ def shifts_to_touch(
         own = (transform_points(invert_se3(pose[:, parent]), clouds) - one.pivot[:, joint, None]) @ across
         far = _distances(own, part == parent, part == child)
         shift, now, then = _nearest_line(far)
-        if now - then > _WORTH:
+        if now - then > (_WORTH_IN_VIEWS if views else _WORTH):
             shifts[joint] = across @ shift.to(across)
         apart[joint] = clouds.new_tensor([now, then])
     return shifts, apart

@@ -1,9 +1,9 @@
 """What `inference.part_frames` and `inference.common_shape` are learnt from: predictions of training clouds.
 
-How the faces of their parts lie, or if they have none, which joints are parallel to the body (`line_lessons`); then, of
-complete clouds, where joint lines are, and where faces say how clouds are turned, what they have in common. Or, where
-parts slide, how views are turned (`inference.object_frame`), which part their points are of (`view_lessons`), and which
-ends of parts they show (`inference.front_ends`).
+How the faces of their parts lie, or if they have none, which joints are parallel to the body (`line_lessons`); then,
+unless scans have taught it, where joint lines are; and, of complete clouds that are turned as faces say, what they have
+in common. Or, where parts slide, how views are turned (`inference.object_frame`), which part their points are of
+(`view_lessons`), and which ends of parts they show (`inference.front_ends`).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def learn_part_frames(
 ) -> None:
     """Find out which parts have faces that say how they are turned, then where joint lines are and what is common.
 
-    The latter two of complete clouds alone. Where parts slide, it is how whole objects are turned.
+    The last of complete clouds alone. Where parts slide, it is how whole objects are turned.
     """
     estimator = module.estimator
     if module.articulated.joint_type != REVOLUTE:
@@ -79,14 +79,16 @@ def learn_part_frames(
         frames.measured.fill_(False)
         tell(log, "turned as faces say, shapes fit worse: they say nothing")
     turned = not frames.measured.any() and learn_joint_axes(module, explained, clouds)
-    if estimator.observation.orientation.limited:
-        return
+    observation = estimator.observation
+    views = observation.orientation.limited
+    if views and not observation.bidirectional:
+        return  # complete scans, which taught these views, show where lines are
     if turned:
         explained = explain(module, clouds, "joint axes")
     few = slice(_CLOUDS)
     explained = explained.rows(torch.arange(len(clouds), device=clouds.device)[few])
     explained = learn_joint_lines(module, explained, clouds[few])
-    if frames.learnt:
+    if frames.learnt and not views:
         _learn_common_shape(module, explained, clouds[few])
 
 

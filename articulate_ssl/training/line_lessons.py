@@ -50,7 +50,7 @@ def learn_joint_lines(
     estimator, points = module.estimator, clouds[:, : registered_points(module)]
     for _ in range(_ROUNDS):
         fitted = estimator.final.in_proportion(explained, points, clouds)
-        shifts, apart = shifts_to_touch(fitted, clouds)
+        shifts, apart = shifts_to_touch(fitted, clouds, module.orientation.limited)
         if not shifts.any():
             break
         for joint, (before, after) in enumerate(apart.tolist()):

@@ -271,6 +271,24 @@ def test_a_module_learns_from_what_it_predicts(monkeypatch, worse, learnt):
     assert learnt or not module.part_frames.measured.any()
 
 
+@pytest.mark.parametrize(
+    ("orientation_range", "unidirectional", "lines", "common"),
+    [(180.0, False, True, True), (100.0, False, True, False), (100.0, True, False, False)],
+)
+def test_lines_are_learnt_unless_scans_have_taught_them(monkeypatch, orientation_range, unidirectional, lines, common):
+    module, data = tiny_module(orientation_range=orientation_range), _data(count=4)
+    module.estimator.observation = replace(module.estimator.observation, unidirectional=unidirectional)
+    one, asked = _explained(OVEN, data), []
+    monkeypatch.setattr(module.estimator, "explained", lambda points, *_: one)
+    monkeypatch.setattr(module.articulated.category, "articulated_shape", lambda kind: true_shape(OVEN, data))
+    monkeypatch.setattr(frame_lessons, "_explain_as_well", lambda *_: True)
+    monkeypatch.setattr(frame_lessons, "learn_joint_axes", lambda *_: False)
+    monkeypatch.setattr(frame_lessons, "learn_joint_lines", lambda _, one, clouds: asked.append("lines") or one)
+    monkeypatch.setattr(frame_lessons, "_learn_common_shape", lambda *_: asked.append("common"))
+    learn_part_frames(module, data.points)
+    assert asked == ["lines"] * lines + ["common"] * common
+
+
 def test_an_estimate_with_dense_clouds_is_settled(oven, monkeypatch):
     """And one without, as with networks alone, is not."""
     module = tiny_module(inference=InferenceOptions(proportions=2))

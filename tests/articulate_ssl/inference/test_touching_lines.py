@@ -6,6 +6,7 @@ import pytest
 import torch
 from articulated_objects import GLASSES, LAPTOP, OVEN, clouds, true_hypotheses
 
+from articulate_ssl.inference import touching_lines
 from articulate_ssl.inference.touching_lines import shifts_to_touch
 
 NEAR = 0.055  # parts are .02 to .05 thick, and where they are hardly farther lines stay
@@ -47,6 +48,15 @@ def test_lines_stay_where_parts_touch(design):
     shifts, apart = shifts_to_touch(true_hypotheses(design, data), data.points)
     assert not shifts.any()
     assert (apart[:, 0] < NEAR).all()
+
+
+@pytest.mark.parametrize("views", [False, True])
+def test_in_views_parts_must_come_nearer_by_more(monkeypatch, views):
+    data = _data(OVEN)
+    one = true_hypotheses(OVEN, data)
+    monkeypatch.setattr(touching_lines, "_nearest_line", lambda _: (torch.tensor([0.04, 0.0]), 0.05, 0.025))
+    shifts, _ = shifts_to_touch(one, data.points, views)
+    assert bool(shifts.any()) != views
 
 
 def test_clouds_without_one_of_the_parts_say_nothing():
