@@ -13,6 +13,7 @@ import yaml
 from articulate_ssl.baselines import METHODS
 from articulate_ssl.comparison import __main__ as command
 from articulate_ssl.comparison import jobs as jobs_module
+from articulate_ssl.comparison.figure import LEVELS, level
 from articulate_ssl.comparison.jobs import Job, Setting, make_data
 from articulate_ssl.comparison.measured import Measured
 from articulate_ssl.comparison.results import Results, RowResult, collect
@@ -332,6 +333,16 @@ def test_a_row_says_if_it_was_given_which_clouds_show_one_object(tmp_path, monke
     views = as_markdown(collect(_setting(tmp_path, "partial"), ["staged", MULTI_STATE], [0], []))
     of_views = [line for line in views.splitlines() if line.startswith("| ours")]
     assert ["complete scans" in line for line in of_views[:6]] == [False] * 3 + [bool(more)] * 3
+
+
+def test_rows_stand_in_the_band_of_the_most_that_they_are_given(tmp_path, monkeypatch):
+    monkeypatch.setattr(Job, "finished", True)
+    told = {MULTI_STATE: {"setting": "multi-state"}}
+    monkeypatch.setattr(Job, "report", lambda job, _column: _report() | told.get(job.learner, {}))
+    names = ["staged", MULTI_STATE, "bae_net", "npcs_epn", "oracle_icp"]
+    results = collect(_setting(tmp_path, "partial"), names, [0], [])
+    bands = {row.row.learner: LEVELS[level(row)] for row in results.rows}
+    assert [bands[name] for name in names] == list(LEVELS)
 
 
 def test_failures_and_bad_names_are_exit_codes(tmp_path, programs, capsys):
