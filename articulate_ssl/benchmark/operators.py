@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from articulate_ssl.benchmark.ceiling import ceiling
 from articulate_ssl.benchmark.cheaper_backbones import cheaper_backbones
@@ -18,10 +20,11 @@ from articulate_ssl.network.backbone import EquivariantBackbone
 from articulate_ssl.ops import chamfer, reference
 from articulate_ssl.ops.group_convolution import group_convolution
 from articulate_ssl.ops.neighborhood import Neighborhood, build_neighborhood
+from articulate_ssl.ops.spin_images import spin_images
 
 
 def operators(machine: Machine) -> list[Result]:
-    """Convolution layer 64 -> 128, backbone and Chamfer distance against their twins, at paper size."""
+    """Convolution layer 64 -> 128, backbone, Chamfer distance and spin images against their twins, at paper size."""
     torch.manual_seed(0)
     backbone = EquivariantBackbone().to(machine.device)
     points = random_clouds(machine, 1, 512)
@@ -32,6 +35,7 @@ def operators(machine: Machine) -> list[Result]:
         *cheaper_backbones(machine, points, features.detach(), neighborhood),
         *_backbone(machine, backbone, points),
         *_chamfer(machine),
+        *_spin_images(machine),
     ]
 
 
@@ -96,3 +100,14 @@ def _chamfer(machine: Machine) -> list[Result]:
         5,
     )
     return [Result("chamfer_fwd_bwd_ratio", "Chamfer 8 x 1024 x 1024, forward + backward", ratios, "x")]
+
+
+def _spin_images(machine: Machine) -> list[Result]:
+    directions = torch.randn(8, 4096, 3, generator=torch.Generator().manual_seed(0))
+    surface = (0.3 * functional.normalize(directions, dim=-1)).to(machine.device)
+    twin, fast = (partial(images, surface[:, :1024], surface) for images in (reference.spin_images, spin_images))
+    ratios, seconds = ratios_and_seconds(machine, twin, fast, 5)
+    return [
+        Result("spin_images_ratio", "spin images of 1024 points, twin / ours", ratios, "x"),
+        Result(None, "  ours, a cloud", [some / len(surface) for some in seconds], "s"),
+    ]

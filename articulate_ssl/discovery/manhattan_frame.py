@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from articulate_ssl.ops.neighborhood import nearest_neighbors
+
 _STRIDE = 4  # normals are measured at every fourth point
 # From so many neighbours, and how thin they are at most, in their own width, if they lie in a plane and not across an
 # edge. A noisy cloud has no planes of so few neighbours that are so thin: the first of these windows counts in which
@@ -34,12 +36,11 @@ def _normals(
     cloud: Tensor,  # [N, 3]
 ) -> tuple[Tensor, Tensor]:  # [m, 3], [m] bool
     """As `surface_normals`, in the first window that sees planes, else in the first of all."""
-    first = None
+    first, at = None, torch.arange(0, len(cloud), _STRIDE, device=cloud.device)[None]
     for neighbours, flatness in _WINDOWS:
         if first is not None and neighbours > _SMALL * len(cloud):
             break
-        near = torch.cdist(cloud[::_STRIDE], cloud).topk(neighbours, largest=False).indices  # [m, k]
-        patch = cloud[near]
+        patch = nearest_neighbors(cloud[None], neighbours, at).offset[0].permute(1, 2, 0)  # [m, k, 3]
         offset = patch - patch.mean(dim=1, keepdim=True)
         variance, directions = torch.linalg.eigh(offset.mT @ offset)
         planar = variance[:, 0] < flatness**2 * variance[:, 1]

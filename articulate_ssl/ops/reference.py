@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor
 from torch.nn.functional import layer_norm, leaky_relu
@@ -10,6 +12,7 @@ from articulate_ssl.geometry.kernel_points import KernelPoints
 from articulate_ssl.geometry.rotation_group import RotationGroup
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.ops.neighborhood import INFLUENCE, KERNEL_RADIUS, Neighborhood
+from articulate_ssl.ops.spin_images import DENSE_POINTS, FACES, HEIGHTS, LEAST, NEIGHBORS, RADIUS, RINGS
 
 
 def group_convolution(
@@ -123,3 +126,56 @@ def layer_norm_leaky_relu(
 ) -> Tensor:  # [..., C]
     """LeakyReLU(LayerNorm(features)) in plain autograd."""
     return leaky_relu(layer_norm(features, weight.shape, weight, bias, eps), slope)
+
+
+def spin_images(
+    points: Tensor,  # [B, N, 3], the leading points of `dense`
+    dense: Tensor,  # [B, P, 3]
+) -> tuple[Tensor, Tensor]:  # [B, N, SPIN_CHANNELS] in [0, 1], [B, N, 3] unit or zero
+    """Histograms of heights over tangent planes, and normals, as `ops.spin_images` says, all neighbours at once."""
+    cloud = dense[:, :DENSE_POINTS]
+    if cloud.shape[1] < points.shape[1]:
+        cloud = points
+    between = torch.cdist(points, cloud, compute_mode="donot_use_mm_for_euclid_dist")
+    near = between.topk(min(NEIGHBORS, cloud.shape[1]), largest=False).indices  # [B, N, n]
+    offset = cloud[torch.arange(len(cloud), device=cloud.device)[:, None, None], near] - points[:, :, None]
+    distance = offset.norm(dim=-1)
+    near = (1 - (distance / RADIUS).square()).relu()
+    _, normal = _tangent_plane(offset, near)
+    height = (offset @ normal[..., None]).squeeze(-1)
+    for face in FACES:
+        # Tukey's biweight: what is off the face does not tilt it at all.
+        weight = near * (1 - (height / face).square()).relu().square()
+        middle, finer = _tangent_plane(offset, weight)
+        fitted = ((offset - middle[..., None, :]) @ finer[..., None]).squeeze(-1)
+        enough = (weight > 0).sum(-1, keepdim=True) >= LEAST
+        height, normal = torch.where(enough, fitted, height), torch.where(enough, finer, normal)
+    inside = (near > 0).to(height)
+    known = (inside.sum(-1, keepdim=True) >= LEAST).to(height)
+    inside = inside * known
+    outward = torch.where((height * inside).sum(-1, keepdim=True) > 0, -1.0, 1.0)
+    height, normal = height * outward, normal * outward * known
+    radial = (distance.square() - height.square()).clamp(min=0).sqrt() / RADIUS
+    bins = torch.tensor(HEIGHTS, dtype=height.dtype, device=height.device)
+    gap = torch.cat([bins[1:2] - bins[:1], bins.diff(), bins[-1:] - bins[-2:-1]])
+    above = height[..., None] - bins
+    # Linear interpolation between bins.
+    share = (1 - torch.maximum(above / gap[1:], -above / gap[:-1])).relu()  # [B, N, n, bins]
+    images = []
+    for low, high in pairwise(RINGS):
+        ring = inside * (radial >= low) * (radial < high)
+        total = ring.sum(-1, keepdim=True).clamp(min=1)
+        images.append((ring[..., None, :] @ share).squeeze(-2) / total)
+    return torch.cat(images, dim=-1), normal
+
+
+def _tangent_plane(
+    offset: Tensor,  # [..., n, 3]
+    weight: Tensor,  # [..., n]
+) -> tuple[Tensor, Tensor]:  # [..., 3], [..., 3] unit
+    """Weighted mean of the offsets, and the direction in which they vary least."""
+    weight = weight / weight.sum(-1, keepdim=True).clamp(min=1e-12)
+    middle = (weight[..., None] * offset).sum(-2)
+    centred = (offset - middle[..., None, :]) / RADIUS
+    covariance = (weight[..., None] * centred).transpose(-1, -2) @ centred
+    return middle, torch.linalg.eigh(covariance).eigenvectors[..., 0]

@@ -33,7 +33,8 @@ def spin_images(
 ) -> tuple[Tensor, Tensor]:  # [B, N, SPIN_CHANNELS] in [0, 1], [B, N, 3] unit or zero
     """Histograms of the heights of neighbours over every point's tangent plane, one per ring around the normal.
 
-    And this normal. It is found from the points, as everything else here.
+    And this normal. It is found from the points, as everything else here. `ops.reference` has the readable twin; this
+    one keeps coordinates apart and, on a CPU, what it works on in cache.
 
     Normals point and heights are positive away from where most of the neighbours are, that is out of a plate. If the
     cloud is moved rigidly, normals turn and images stay. All is zero where fewer than `LEAST` points are near.
@@ -42,44 +43,62 @@ def spin_images(
     if cloud.shape[1] < points.shape[1]:
         cloud = points
     centers = torch.arange(points.shape[1], device=points.device).expand(len(points), -1)
-    offset = nearest_neighbors(cloud, NEIGHBORS, centers).offset.permute(0, 2, 3, 1)  # [B, N, n, 3]
-    distance = offset.norm(dim=-1)
-    near = (1 - (distance / RADIUS).square()).relu()
-    _, normal = tangent_plane(offset, near)
-    height = (offset @ normal[..., None]).squeeze(-1)
+    samples = 1 if points.device.type == "cpu" else len(points)
+    found = [
+        _images(nearest_neighbors(some, NEIGHBORS, at).offset)
+        for some, at in zip(cloud.split(samples), centers.split(samples), strict=True)
+    ]
+    images, normal = zip(*found, strict=True)
+    return torch.cat(images), torch.cat(normal)
+
+
+def _images(
+    offset: Tensor,  # [B, 3, N, n] of the neighbours
+) -> tuple[Tensor, Tensor]:  # [B, N, SPIN_CHANNELS], [B, N, 3]
+    """See `spin_images`."""
+    square = offset.square().sum(dim=1)
+    near = (1 - square / RADIUS**2).relu()
+    middle, normal = _tangent_plane(offset, near)
+    height = _over(offset, normal)
     for face in FACES:
         # Tukey's biweight: what is off the face does not tilt it at all.
         weight = near * (1 - (height / face).square()).relu().square()
-        middle, finer = tangent_plane(offset, weight)
-        fitted = ((offset - middle[..., None, :]) @ finer[..., None]).squeeze(-1)
-        enough = (weight > 0).sum(-1, keepdim=True) >= LEAST
-        height, normal = torch.where(enough, fitted, height), torch.where(enough, finer, normal)
+        middle, finer = _tangent_plane(offset, weight)
+        enough = (weight > 0).sum(-1) >= LEAST
+        fitted = _over(offset - middle[..., None], finer)
+        height = torch.where(enough[..., None], fitted, height)
+        normal = torch.where(enough[:, None], finer, normal)
     inside = (near > 0).to(height)
-    known = (inside.sum(-1, keepdim=True) >= LEAST).to(height)
-    inside = inside * known
-    outward = torch.where((height * inside).sum(-1, keepdim=True) > 0, -1.0, 1.0)
-    height, normal = height * outward, normal * outward * known
-    radial = (distance.square() - height.square()).clamp(min=0).sqrt() / RADIUS
-    bins = torch.tensor(HEIGHTS, dtype=height.dtype, device=height.device)
-    gap = torch.cat([bins[1:2] - bins[:1], bins.diff(), bins[-1:] - bins[-2:-1]])
-    above = height[..., None] - bins
-    # Linear interpolation between bins.
-    share = (1 - torch.maximum(above / gap[1:], -above / gap[:-1])).relu()  # [B, N, n, bins]
-    images = []
-    for low, high in pairwise(RINGS):
-        ring = inside * (radial >= low) * (radial < high)
-        total = ring.sum(-1, keepdim=True).clamp(min=1)
-        images.append((ring[..., None, :] @ share).squeeze(-2) / total)
-    return torch.cat(images, dim=-1), normal
+    known = (inside.sum(-1) >= LEAST).to(height)
+    outward = torch.where((height * inside).sum(-1) > 0, -known, known)
+    height, normal = height * outward[..., None], normal * outward[:, None]
+    radial = (square - height.square()).clamp(min=0).sqrt() / RADIUS
+    rings = [inside * (radial >= low) * (radial < high) for low, high in pairwise(RINGS)]
+    rings = [ring * (known / ring.sum(-1).clamp(min=1))[..., None] for ring in rings]
+    bins, images = (2 * HEIGHTS[0] - HEIGHTS[1], *HEIGHTS, 2 * HEIGHTS[-1] - HEIGHTS[-2]), []
+    for low, middle, high in zip(bins, bins[1:], bins[2:], strict=False):
+        # Linear interpolation between bins.
+        share = torch.minimum((height - low) / (middle - low), (high - height) / (high - middle)).relu()
+        images.append([(ring * share).sum(-1) for ring in rings])
+    return torch.stack([some for ring in zip(*images, strict=True) for some in ring], dim=-1), normal.mT
 
 
-def tangent_plane(
-    offset: Tensor,  # [..., n, 3]
-    weight: Tensor,  # [..., n]
-) -> tuple[Tensor, Tensor]:  # [..., 3], [..., 3] unit
+def _tangent_plane(
+    offset: Tensor,  # [B, 3, N, n]
+    weight: Tensor,  # [B, N, n]
+) -> tuple[Tensor, Tensor]:  # [B, 3, N], [B, 3, N] unit
     """Weighted mean of the offsets, and the direction in which they vary least."""
     weight = weight / weight.sum(-1, keepdim=True).clamp(min=1e-12)
-    middle = (weight[..., None] * offset).sum(-2)
-    centred = (offset - middle[..., None, :]) / RADIUS
-    covariance = (weight[..., None] * centred).transpose(-1, -2) @ centred
-    return middle, torch.linalg.eigh(covariance).eigenvectors[..., 0]
+    middle = (weight[:, None] * offset).sum(-1)
+    centred = (offset - middle[..., None]) / RADIUS
+    weighted = weight[:, None] * centred
+    rows = [torch.stack([(weighted[:, i] * centred[:, j]).sum(-1) for j in range(3)], dim=-1) for i in range(3)]
+    return middle, torch.linalg.eigh(torch.stack(rows, dim=-2)).eigenvectors[..., 0].mT
+
+
+def _over(
+    offset: Tensor,  # [B, 3, N, n]
+    normal: Tensor,  # [B, 3, N]
+) -> Tensor:  # [B, N, n]
+    """Heights over planes through the origin."""
+    return (offset * normal[..., None]).sum(dim=1)

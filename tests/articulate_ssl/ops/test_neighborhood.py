@@ -60,6 +60,24 @@ def test_float32_weights_far_from_the_origin():
     assert (exact.weight.sum(dim=2) - rounded.weight.sum(dim=2)).abs().max() < 1e-4
 
 
+@pytest.mark.parametrize("count", [1, 16])
+def test_a_tree_of_many_points_finds_what_all_distances_find(count):
+    points = torch.rand(2, 1024, 3, dtype=torch.float64)
+    points[1, :600] = points[1, 0]  # one place
+    centers = torch.stack([torch.randperm(1024)[:256] for _ in points])
+    neighbors = nearest_neighbors(points, count, centers)
+    queries = points.gather(1, centers[..., None].expand(-1, -1, 3))
+    nearest = torch.cdist(queries, points).topk(count, largest=False).values
+    assert neighbors.index.shape == (2, 256, count)
+    torch.testing.assert_close(neighbors.offset.norm(dim=1).sort().values, nearest, rtol=0, atol=1e-7)
+
+
+def test_points_that_are_nowhere_are_no_reason_to_stop():
+    points = torch.rand(1, 1024, 3)
+    points[0, 3] = torch.nan
+    assert torch.isfinite(nearest_neighbors(points, 4).offset[..., 4:, :]).all()
+
+
 @pytest.mark.parametrize("shape", [(3, 3), (1, 0, 3), (1, 5, 2)])
 def test_wrong_shapes_are_refused(shape):
     with pytest.raises(ValueError, match="points must be"):
