@@ -18,19 +18,20 @@ from typing import ClassVar
 
 import roma
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from articulate_ssl.baselines.method import DENSE_CLOUDS, JOINTS, PART_LABELS, PART_POSES, Effort, Method, Problem
-from articulate_ssl.baselines.npcs_network import CoordinateNetwork, WholeShape
-from articulate_ssl.baselines.part_coordinates import joint_states, nearest_on_line, ransac_poses
+from articulate_ssl.baselines.part_coordinates import ransac_poses
 from articulate_ssl.baselines.perfect_oracle import part_points
 from articulate_ssl.geometry.orientation_range import OrientationRange, mean_rotation
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
 from articulate_ssl.inference.prediction import Prediction
+from articulate_ssl.network.coordinate_network import CoordinateNetwork, WholeShape
 from articulate_ssl.network.surface_network import MODES, SurfaceCloud, SurfaceSize
 from articulate_ssl.ops.spin_images import SPIN_CHANNELS, spin_images
+from articulate_ssl.shape.part_poses import joint_states, nearest_on_line
 from datamodules.articulated_data_module import ArticulatedDataModule
 
 _NEAR_DEG = 10.0  # standard deviation per axis of a frame that was looked at before
@@ -87,6 +88,19 @@ class Target:
         return every.gather(1, self.part_id[:, None, :, None].expand(-1, -1, -1, 3)).squeeze(1)
 
 
+class ModeNetwork(CoordinateNetwork):
+    """And a head for the mode."""
+
+    def __init__(self, num_parts: int, size: SurfaceSize) -> None:
+        """Args: K; sizes."""
+        super().__init__(num_parts, size)
+        self.mode = nn.Linear(size.head_dim, 1)
+
+    def mode_of(self, said: WholeShape) -> Tensor:  # [B]
+        """Logit that the frame is near the canonical one."""
+        return self.mode(said.whole).squeeze(-1)
+
+
 class NPCS(Method):
     """What both rows share.
 
@@ -103,7 +117,7 @@ class NPCS(Method):
         super().__init__(problem)
         self.size = size or SurfaceSize()
         joints = problem.num_parts - 1
-        self.network = CoordinateNetwork(problem.num_parts, self.size)
+        self.network = ModeNetwork(problem.num_parts, self.size)
         self.register_buffer("elements", rotation_group(MODES).elements.float(), persistent=False)
         self.register_buffer("cube", rotation_group(24).elements.float(), persistent=False)
         self.register_buffer("joint_parent", torch.zeros(joints, dtype=torch.long))
@@ -149,7 +163,7 @@ class NPCS(Method):
         right = self.right_frames(target)
         wrong = self.wrong_frames(geometry, target)
         loss, positive = self.point_loss(geometry.seen_in(right), right, target, points)
-        negative = self.network.look(geometry.seen_in(wrong)).mode.unflatten(0, (-1, wrong.shape[1]))
+        negative = self.network.mode_of(self.network.look(geometry.seen_in(wrong))).unflatten(0, (-1, wrong.shape[1]))
         positive = positive.unflatten(0, (-1, right.shape[1]))
         # Every right frame against all wrong ones of its cloud.
         logits = torch.cat([positive[..., None], negative[:, None].expand(-1, right.shape[1], -1)], dim=-1)
@@ -240,7 +254,7 @@ class NPCS(Method):
         }
         for name, value in losses.items():
             self.log(name, value)
-        return sum(losses.values()), said.mode
+        return sum(losses.values()), self.network.mode_of(said)
 
     @torch.no_grad()
     def predict(self, batch: dict[str, Tensor]) -> Prediction:
@@ -282,7 +296,7 @@ class NPCS(Method):
         logits, rotations = [], []
         for rows in _chunks(len(frame), max(1, _CHUNK_COPIES // frame.shape[1])):
             said = self.network.look(geometry.rows(rows).seen_in(frame[rows]))
-            logits.append(said.mode.unflatten(0, (-1, frame.shape[1])))
+            logits.append(self.network.mode_of(said).unflatten(0, (-1, frame.shape[1])))
             rotations.append(frame[rows] @ said.rotation[:, self.root].unflatten(0, (-1, frame.shape[1])))
         logit, rotation = torch.cat(logits), torch.cat(rotations)
         inside = self.orientation.contains(self.mean_rotation.T @ rotation)

@@ -1,4 +1,4 @@
-"""From normalised part coordinates to poses and joints: RANSAC with Procrustes per part, joints as in ANCSH.
+"""From normalised part coordinates to poses: RANSAC with Procrustes per part.
 
 Nothing here learns. Part coordinates (NPCS) are rest-state coordinates about the part's bounding-box centre, in the
 object's axes and the cloud's unit: clouds are normalised already, so a part's pose is rigid (paper, appendix "NPCS").
@@ -6,33 +6,17 @@ object's axes and the cloud's unit: clouds are normalised already, so a part's p
 
 from __future__ import annotations
 
-import roma
 import torch
 from torch import Tensor
 
-from articulate_ssl.geometry.screw import REVOLUTE
-from articulate_ssl.geometry.se3 import se3, transform_points
+from articulate_ssl.geometry.se3 import transform_points
+from articulate_ssl.shape.part_poses import rigid_fit
 
 HYPOTHESES = 64  # of RANSAC; a third of outliers leaves one in three of them clean
 SAMPLE_POINTS = 4  # of each: three fix a pose, a fourth damps noise
 INLIER_DISTANCE = 0.05  # cloud units, as the metrics' calibration has it
 REFINEMENTS = 3  # Procrustes fits to the inliers of the one before
 _SEED = 0
-
-
-def rigid_fit(
-    source: Tensor,  # [..., n, 3]
-    target: Tensor,  # [..., n, 3]
-    weight: Tensor,  # [..., n], not negative, not all zero
-) -> Tensor:  # [..., 4, 4]
-    """Pose that moves source to target with the least weighted squared distance (Kabsch, Umeyama at scale one)."""
-    weight = (weight / weight.sum(-1, keepdim=True).clamp(min=1e-12))[..., None]
-    source_mean, target_mean = (weight * source).sum(-2), (weight * target).sum(-2)
-    covariance = ((target - target_mean[..., None, :]) * weight).transpose(-1, -2) @ (
-        source - source_mean[..., None, :]
-    )
-    rotation = roma.special_procrustes(covariance)
-    return se3(rotation, target_mean - (rotation @ source_mean[..., None]).squeeze(-1))
 
 
 def ransac_poses(
@@ -64,28 +48,3 @@ def ransac_poses(
         near = (distance < INLIER_DISTANCE) * weight
         pose = rigid_fit(coordinates, target, torch.where(near.sum(-1, keepdim=True) > 1e-6, near, weight))
     return pose
-
-
-def joint_states(
-    pose: Tensor,  # [B, K, 4, 4] part space -> camera space
-    center: Tensor,  # [B, K, 3] part centres in the object's rest-state frame
-    axis: Tensor,  # [B, J, 3] unit, in the axes of part spaces, which are parallel at rest
-    parent: Tensor,  # [J]
-    child: Tensor,  # [J]
-    joint_type: int,
-) -> Tensor:  # [B, J], relative to rest
-    """State of every joint by the pose of its child relative to its parent, about or along the axis."""
-    turn_to_parent = pose[:, parent, :3, :3].transpose(-1, -2)
-    if joint_type == REVOLUTE:
-        relative = turn_to_parent @ pose[:, child, :3, :3]
-        return (roma.rotmat_to_rotvec(relative) * axis).sum(-1)
-    offset = (turn_to_parent @ (pose[:, child, :3, 3] - pose[:, parent, :3, 3])[..., None]).squeeze(-1)
-    return ((offset - (center[:, child] - center[:, parent])) * axis).sum(-1)
-
-
-def nearest_on_line(
-    pivot: Tensor,  # [..., 3]
-    axis: Tensor,  # [..., 3] unit
-) -> Tensor:  # [..., 3]
-    """The point of the joint line (pivot, axis) that is nearest to the origin: the one pivot that is well defined."""
-    return pivot - (pivot * axis).sum(-1, keepdim=True) * axis

@@ -19,6 +19,8 @@
    (`hinge_sides`), and what stood wrongly is explained anew.
 6. *Hand*, where upright cameras see objects and their mirror images: clouds are explained in a mirror, too, and how
    well either explains them decides (`handedness`).
+7. *Poses* of a prediction that is not registered, and which parts points are of, a network says that fits taught, in
+   the frame of that prediction (`pose_network`).
 
 Training takes the first two steps too; nothing here knows a loss or an optimiser.
 """
@@ -52,6 +54,7 @@ from articulate_ssl.inference.object_frame import ObjectFrame
 from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.inference.packaging import as_prediction
 from articulate_ssl.inference.part_frames import PartFrames
+from articulate_ssl.inference.pose_network import PoseNetwork
 from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.inference.relief import NUM_FEATURES
 from articulate_ssl.inference.sliding_search import SlidingSearch
@@ -95,6 +98,7 @@ class PoseEstimator:
         object_frame: How views of what slides are turned, if it was learnt; a module owns it.
         front_ends: Which ends of what slides views show, if it was learnt; a module owns it.
         states: Which joint states training clouds showed; a module owns it.
+        pose_network: Which poses fits would say, if that was taught; a module owns it.
     """
 
     agreement: float = 0.0
@@ -121,6 +125,7 @@ class PoseEstimator:
         self.common_shape = CommonShape(articulated.num_parts)
         self.object_frame = ObjectFrame()
         self.front_ends = FrontEnds(articulated.num_parts - 1)
+        self.pose_network = PoseNetwork(articulated.num_parts)
         self.observation = replace(observation, camera=self.hinge_sides.camera)
         self.registration = HypothesisRegistration(inference, self.observation, self.states)
         self.decision = Decision(articulated, self.registration, self.two_ways)
@@ -138,7 +143,8 @@ class PoseEstimator:
     def reads_dense(self) -> bool:
         """Whether what is decided or measured in the end reads all points of a cloud."""
         decides = self.two_ways.learnt or self.two_ways.surface is not None or self.hinge_sides.learnt
-        return bool(decides or self.part_frames.learnt or self.object_frame.learnt)
+        measures = self.part_frames.learnt or self.object_frame.learnt or self.pose_network.learnt
+        return bool(decides or measures)
 
     def align(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Stage 0: clouds turned roughly to canonical orientation [B, N, 3], and the pose [B, 4, 4] that undoes it."""
@@ -200,13 +206,25 @@ class PoseEstimator:
         """`predict`, and of every cloud the best hypothesis that is turned another way (the same, if none is).
 
         Args:
-            fits: Predictions take the clouds' proportions; rivals do not.
+            fits: Predictions take the clouds' proportions, or poses as a network says; rivals do not.
 
         Raises:
             ValueError: if a cloud has NaN or infinite points.
         """
         if not torch.isfinite(points).all():
             raise ValueError("a cloud has NaN or infinite points")
+        found, rival = self._decided(points, num_points, refine, dense, fits)
+        if not fits or dense is None or not self.pose_network.learnt:
+            return found, rival
+        registers = (self.inference.refine if refine is None else refine) is not False
+        says = self.pose_network.labelled if registers else self.pose_network.posed
+        with torch.autocast(points.device.type, enabled=False):
+            return says(found, points, dense), rival
+
+    def _decided(
+        self, points: Tensor, num_points: int, refine: bool | None, dense: Tensor | None, fits: bool
+    ) -> tuple[Prediction, Prediction]:
+        """See `predict_with_rivals`: before a network says poses."""
         *seen, error = self._explained(points, num_points, refine, dense, fits)
         if self.hinge_sides.learnt:
             seen = [self.hinge_sides.counted_from_closed(one) for one in seen]

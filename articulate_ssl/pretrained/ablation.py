@@ -73,6 +73,10 @@ def _no_network_of_parts(estimator: PoseEstimator) -> None:
     estimator.sliding.parts = None
 
 
+def _no_network_of_poses(estimator: PoseEstimator) -> None:
+    estimator.pose_network.network = None
+
+
 def _no_network_of_views_parts(estimator: PoseEstimator) -> None:
     estimator.view_search.parts = None
 
@@ -103,6 +107,7 @@ ABLATIONS = (
         lambda of: of.object_frame.surface is not None,
         _no_network_of_view_turns,
     ),
+    Ablation("the network that says poses", lambda of: of.pose_network.learnt, _no_network_of_poses),
     Ablation("fronts of drawers", lambda of: of.front_ends.learnt, lambda of: of.front_ends.forget()),
     Ablation(
         "how views are square, and these networks",

@@ -41,6 +41,7 @@ from articulate_ssl.training.hub import HubWeights
 from articulate_ssl.training.joint_limits import learn_joint_limits
 from articulate_ssl.training.label_free_report import LabelFreeReport
 from articulate_ssl.training.object_lessons import learn_objects
+from articulate_ssl.training.pose_lessons import learn_poses
 from articulate_ssl.training.recipes import recipe_class
 from articulate_ssl.training.recipes.recipe import Outcome
 from articulate_ssl.training.running_statistics import RadiusStatistics
@@ -58,7 +59,7 @@ JOINT_TYPES = {"revolute": REVOLUTE, "prismatic": PRISMATIC}
 # first, as what is explained beyond them must not teach, and again when it is known how faces lie: that moves states.
 LESSONS = (
     *("first_limits", "two_ways", "turns", "objects", "handedness", "part_frames", "view_turns", "hinge_sides"),
-    *("joint_limits", "confidence"),
+    *("joint_limits", "poses", "confidence"),
 )
 # Terms of the loss, by the names that they are logged under.
 _LOGGED = {
@@ -105,6 +106,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             (`inference.front_ends`); 0 learns nothing of it.
         hinge_sides_samples: Training clouds from which it is learnt whether some objects are hinged at another side
             than most (`inference.hinge_sides`); 0 learns nothing of it.
+        pose_samples: Training clouds by whose registered predictions a network learns to say poses, where parts turn
+            (`inference.pose_network`); half an hour, most of it to register them. 0 learns none.
         orientation_range: How far objects are turned from their mean orientation at most, in degrees; 180 stands for
             any orientation, less where a camera is held upright.
 
@@ -131,6 +134,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         handedness_samples: int = 256,
         part_frames_samples: int = 256,
         hinge_sides_samples: int = 2000,
+        pose_samples: int = 1600,
         orientation_range: float = 180.0,
     ) -> None:
         super().__init__()
@@ -150,6 +154,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         self.two_ways_samples, self.object_samples = two_ways_samples, object_samples
         self.handedness_samples = handedness_samples
         self.part_frames_samples, self.hinge_sides_samples = part_frames_samples, hinge_sides_samples
+        self.pose_samples = pose_samples
 
         self.articulated = ArticulatedNetwork(network, num_parts, JOINT_TYPES[joint_type], state_bound=state_range)
         self.rigid = RigidAlignment(network, num_parts * network.shape_points) if schedule.rigid_steps else None
@@ -163,6 +168,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         self.hinge_sides, self.states = self.estimator.hinge_sides, self.estimator.states
         self.part_frames, self.common_shape = self.estimator.part_frames, self.estimator.common_shape
         self.object_frame, self.front_ends = self.estimator.object_frame, self.estimator.front_ends
+        self.pose_network = self.estimator.pose_network
         self.recipe = recipe_type(self.estimator, objective, schedule, discovery)
         self.radius = RadiusStatistics()
         self.confidence = Confidence()
@@ -238,6 +244,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             "view_turns": (learn_view_turns, self.two_ways_samples if refines and views else 0),
             "hinge_sides": (learn_hinge_sides, self.hinge_sides_samples if refines else 0),
             "joint_limits": limits,
+            "poses": (learn_poses, self.pose_samples if refines and turns else 0),
             "confidence": (learn_confidence, calibration),
         }
         for lesson in LESSONS:
@@ -258,7 +265,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         """Adam; the category's shapes and joints are a group of their own."""
         shared = list(self.articulated.category.parameters())
         # What is learnt after the last step is not trained with the rest, nor when a run that ended goes on.
-        taught = (self.two_ways, self.hinge_sides, self.sliding, self.view_search, self.object_frame)
+        taught = self.two_ways, self.hinge_sides, self.sliding, self.view_search, self.object_frame, self.pose_network
         elsewhere = set(map(id, (*shared, *(parameter for some in taught for parameter in some.parameters()))))
         others = [p for p in self.parameters() if id(p) not in elsewhere]
         optimizer = torch.optim.Adam(

@@ -6,7 +6,6 @@ from synthetic import write_synthetic_set
 from articulate_ssl.baselines.method import Effort, Problem
 from articulate_ssl.baselines.npcs import NPCSEPN, Target, distinct
 from articulate_ssl.baselines.npcs import NPCSKPConv as KPConv
-from articulate_ssl.baselines.npcs_network import WholeShape
 from articulate_ssl.baselines.perfect_oracle import perfect_oracle
 from articulate_ssl.geometry.kernel_points import symmetric_kernel_points
 from articulate_ssl.geometry.rotation_group import rotation_group
@@ -15,6 +14,7 @@ from articulate_ssl.geometry.se3 import se3, transform_points
 from articulate_ssl.metrics.articulated_pose import cloud_errors
 from articulate_ssl.metrics.calibration import calibrate
 from articulate_ssl.network.backbone import GroupConvolutionBlock
+from articulate_ssl.network.coordinate_network import WholeShape
 from articulate_ssl.network.surface_network import SurfaceCloud, SurfaceSize
 from articulate_ssl.ops.neighborhood import correlate, nearest_neighbors
 from articulate_ssl.ops.spin_images import spin_images
@@ -84,7 +84,7 @@ def test_perfect_outputs_of_the_network_are_ground_truth(tmp_path, joint_type, s
     logits = 20 * torch.nn.functional.one_hot(target.part_id, K).float()
     coordinates = target.coordinates(labels["points"])[:, None].expand(-1, K, -1, -1)
     none = torch.zeros(clouds, 1)
-    said = WholeShape(none, none, none, target.center, target.axis, target.pivot, none, none)
+    said = WholeShape(none, none, target.center, target.axis, target.pivot, none, none)
     prediction = method.assemble(labels["points"], logits, coordinates, said, none[:, 0])
     errors = cloud_errors(prediction, labels, calibrate(perfect_oracle(labels), labels))
     for name in ("r_err_deg", "axis_err_deg", "state_err"):

@@ -1,4 +1,7 @@
-"""The network of NPCS: what `SurfaceNetwork` sees in some frame, and heads."""
+"""Which part points are of, and where in it (NPCS, Li et al. 2020): what `SurfaceNetwork` sees in a frame, and heads.
+
+With labels it is the network of NPCS (`baselines.npcs`); without, fits teach it (`inference.pose_network`).
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,6 @@ class WholeShape(NamedTuple):
     """What the network says about clouds seen in some frame, before it looks at single points.
 
     Attributes:
-        mode: [B] logit that the frame is near the canonical one.
         rotation: [B, K, 3, 3] part space -> the frame.
         shift: [B, K, 3] what to add to points in a part's axes to have them about the part's centre.
         center: [B, K, 3] part centres in the object's rest-state frame.
@@ -28,7 +30,6 @@ class WholeShape(NamedTuple):
         whole: [B, D].
     """
 
-    mode: Tensor
     rotation: Tensor
     shift: Tensor
     center: Tensor
@@ -43,14 +44,13 @@ class WholeShape(NamedTuple):
 
 
 class CoordinateNetwork(SurfaceNetwork):
-    """Whole-shape features, and heads for mode, poses, joints, parts and coordinates."""
+    """Whole-shape features, and heads for poses, joints, parts and coordinates."""
 
     def __init__(self, num_parts: int, size: SurfaceSize) -> None:
         """Args: K; sizes."""
         super().__init__(size)
         self.num_parts = num_parts
         first, last, dim = size.dims[0], size.dims[-1], size.head_dim
-        self.mode = nn.Linear(dim, 1)
         self.pose = nn.Linear(dim, 9 * num_parts)
         self.structure = nn.Linear(dim, 3 * num_parts + 6 * (num_parts - 1))
         self.point = nn.Sequential(*layer(first + last + 3 + dim, dim), *layer(dim, dim))
@@ -68,7 +68,6 @@ class CoordinateNetwork(SurfaceNetwork):
         columns = pose[..., :6].unflatten(-1, (3, 2)) + torch.eye(3, 2, dtype=pose.dtype, device=pose.device)
         center, axis, pivot = self.structure(whole).split([3 * K, 3 * K - 3, 3 * K - 3], dim=-1)
         return WholeShape(
-            mode=self.mode(whole).squeeze(-1),
             rotation=roma.special_gramschmidt(columns),
             shift=pose[..., 6:],
             center=center.unflatten(-1, (K, 3)),
