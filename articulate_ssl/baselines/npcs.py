@@ -23,7 +23,6 @@ from torch.nn import functional
 
 from articulate_ssl.baselines.method import DENSE_CLOUDS, JOINTS, PART_LABELS, PART_POSES, Effort, Method, Problem
 from articulate_ssl.baselines.part_coordinates import ransac_poses
-from articulate_ssl.baselines.perfect_oracle import part_points
 from articulate_ssl.geometry.orientation_range import OrientationRange, mean_rotation
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
@@ -31,7 +30,7 @@ from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.network.coordinate_network import CoordinateNetwork, WholeShape
 from articulate_ssl.network.surface_network import MODES, SurfaceCloud, SurfaceSize
 from articulate_ssl.ops.spin_images import SPIN_CHANNELS, spin_images
-from articulate_ssl.shape.part_poses import joint_states, nearest_on_line
+from articulate_ssl.shape.part_poses import joint_states, nearest_on_line, part_shapes
 from datamodules.articulated_data_module import ArticulatedDataModule
 
 _NEAR_DEG = 10.0  # standard deviation per axis of a frame that was looked at before
@@ -317,35 +316,21 @@ class NPCS(Method):
         part_id = probability.argmax(-1)
         own = functional.one_hot(part_id, K).to(points.dtype)
         pose = ransac_poses(coordinates, points, own.transpose(1, 2))
-        origin = points.new_zeros(3)
-        shape = torch.stack(
-            [
-                torch.stack([part_points(c[k], p, k, count, origin) for k in range(K)])
-                for c, p in zip(coordinates, part_id, strict=True)
-            ]
-        )
-        parent = self.joint_parent
-        place = pose[:, parent]
+        joints = self.joint_parent.tolist(), self.joint_child.tolist(), self.problem.joint_type
+        placed = said.placed(pose, *joints)
+        placed["joint_state"] = self.rest_state + placed["joint_state"]
         posed = transform_points(pose, coordinates).gather(1, part_id[:, None, :, None].expand(-1, -1, -1, 3))
-        identity = torch.eye(3, dtype=points.dtype, device=points.device)
         B = len(points)
         return Prediction(
             part_id=part_id,
             part_probability=probability,
-            part_pose=pose,
-            part_shape=shape,
-            assembly=said.center,
-            base_pose=pose[:, self.root] @ se3(identity, -said.center[:, self.root]),
-            joint_parent=parent.expand(B, -1),
+            part_shape=part_shapes(coordinates, part_id, count),
+            joint_parent=self.joint_parent.expand(B, -1),
             joint_child=self.joint_child.expand(B, -1),
-            joint_type=torch.full_like(parent, self.problem.joint_type).expand(B, -1),
-            joint_axis=(place[..., :3, :3] @ said.axis[..., None]).squeeze(-1),
-            joint_pivot=transform_points(place, said.pivot[..., None, :]).squeeze(-2),
-            joint_state=self.rest_state + self.states(pose, said.center, said.axis),
-            canonical_axis=said.axis,
-            canonical_pivot=said.pivot + said.center[:, parent],
+            joint_type=torch.full_like(self.joint_parent, self.problem.joint_type).expand(B, -1),
             reconstruction_error=(posed.squeeze(1) - points).norm(dim=-1).mean(-1),
             margin=margin,
+            **placed,
         )
 
 

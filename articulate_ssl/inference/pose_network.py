@@ -5,7 +5,7 @@ Seen in the frame of the one that was decided for, a cloud stands nearly as all 
 every point is of, and where in the part (`network.coordinate_network`). Poses follow from both at once, by Procrustes,
 and part shapes are the points themselves. It is taught by registered predictions of training clouds
 (`training/pose_lessons.py`), no label is read, and of points near the seams between parts it is right more often than
-they are (docs/experiments.md, step 210).
+they are. With spin images it was no better (docs/experiments.md, step 210).
 """
 
 from __future__ import annotations
@@ -16,12 +16,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import one_hot
 
-from articulate_ssl.geometry.se3 import se3, transform_points
+from articulate_ssl.geometry.se3 import transform_points
 from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.network.coordinate_network import CoordinateNetwork, WholeShape
 from articulate_ssl.network.surface_network import SurfaceCloud, SurfaceSize
-from articulate_ssl.ops.spin_images import spin_images
-from articulate_ssl.shape.part_poses import joint_states, rigid_fit
+from articulate_ssl.shape.part_poses import part_shapes, rigid_fit
 
 SIZE = SurfaceSize(read=512, centers=256)
 _LOOKS = 2  # the second in the frame that the first led to
@@ -61,15 +60,16 @@ class PoseNetwork(nn.Module):
 
         Poses, shapes, joint lines and states, and parts of points are the network's; errors and margins stay.
         """
-        frame, surface = found.base_pose[:, :3, :3], spin_images(points[:, : SIZE.read], dense)
-        few = SurfaceCloud.of(points[:, : SIZE.read], *surface, SIZE)
-        root = _root(found)
+        frame, few = found.base_pose[:, :3, :3], SurfaceCloud.of_points(points[:, : SIZE.read], SIZE)
+        root = next(part for part in range(found.num_parts) if part not in found.joint_child[0].tolist())
         for _ in range(_LOOKS - 1):
             frame = frame @ self.network.look(few.seen_in(frame[:, None])).rotation[:, root]
-        said, logits, coordinates = self._asked(dense, surface, frame)
+        said, logits, coordinates = self._asked(dense, frame)
         found = _labelled(found, logits, points.shape[1])
         pose = part_poses(coordinates[:, :, : points.shape[1]], points, found.part_id)
-        return _assembled(found, pose, said, coordinates)
+        joints = found.joint_parent[0].tolist(), found.joint_child[0].tolist(), int(found.joint_type[0, 0])
+        shape = part_shapes(coordinates, found.dense_part_id, found.part_shape.shape[2])
+        return replace(found, part_shape=shape, **said.placed(pose, *joints))
 
     @torch.no_grad()
     def labelled(
@@ -79,13 +79,12 @@ class PoseNetwork(nn.Module):
         dense: Tensor,  # [B, P, 3] that the points lead, farthest-point order
     ) -> Prediction:
         """The same predictions, in which points are of the parts that the network says."""
-        surface = spin_images(points[:, : SIZE.read], dense)
-        _, logits, _ = self._asked(dense, surface, found.base_pose[:, :3, :3])
+        _, logits, _ = self._asked(dense, found.base_pose[:, :3, :3])
         return _labelled(found, logits, points.shape[1])
 
-    def _asked(self, dense: Tensor, surface: tuple[Tensor, Tensor], frame: Tensor) -> tuple[WholeShape, Tensor, Tensor]:
+    def _asked(self, dense: Tensor, frame: Tensor) -> tuple[WholeShape, Tensor, Tensor]:
         """What is said of the whole clouds, and logits [B, P, K] and coordinates [B, K, P, 3] of their points."""
-        seen = SurfaceCloud.of(dense, *surface, SIZE).seen_in(frame[:, None])
+        seen = SurfaceCloud.of_points(dense, SIZE).seen_in(frame[:, None])
         said = self.network.look(seen)
         return said, *self.network.coordinates(seen, said)
 
@@ -117,49 +116,7 @@ def part_poses(
     return pose
 
 
-def _root(found: Prediction) -> int:
-    """The part that no joint moves."""
-    return next(k for k in range(found.num_parts) if k not in found.joint_child[0].tolist())
-
-
 def _labelled(found: Prediction, logits: Tensor, count: int) -> Prediction:
     """With parts of points, of which so many lead the dense ones, by logits [B, P, K] of the latter."""
     probability, part = logits[:, :count].softmax(-1), logits.argmax(-1)
     return replace(found, part_id=part[:, :count], part_probability=probability, dense_part_id=part)
-
-
-def _assembled(
-    found: Prediction,
-    pose: Tensor,  # [B, K, 4, 4]
-    said: WholeShape,
-    coordinates: Tensor,  # [B, K, P, 3]
-) -> Prediction:
-    """With other poses of parts, and joints as these say; part shapes are coordinates of points that are of parts."""
-    parent, child = found.joint_parent[0].tolist(), found.joint_child[0].tolist()
-    root, count = _root(found), found.part_shape.shape[2]
-    still = torch.eye(3).to(pose)
-    place, joint_type = pose[:, parent], int(found.joint_type[0, 0])
-    return replace(
-        found,
-        part_pose=pose,
-        part_shape=_shapes(coordinates, found.dense_part_id, count),
-        assembly=said.center,
-        base_pose=pose[:, root] @ se3(still, -said.center[:, root]),
-        joint_axis=(place[..., :3, :3] @ said.axis[..., None]).squeeze(-1),
-        joint_pivot=transform_points(place, said.pivot[..., None, :]).squeeze(-2),
-        joint_state=joint_states(pose, said.center, said.axis, parent, child, joint_type),
-        canonical_axis=said.axis,
-        canonical_pivot=said.pivot + said.center[:, parent],
-    )
-
-
-def _shapes(coordinates: Tensor, part_id: Tensor, count: int) -> Tensor:  # [B, K, count, 3]
-    """Of every part the coordinates of its first points, over again if it has fewer; of one that has none, of all."""
-    shapes = []
-    for part, own in enumerate(coordinates.unbind(dim=1)):
-        mine = part_id == part
-        first = (~mine).to(torch.uint8).argsort(dim=1, stable=True)
-        many = torch.where(mine.any(dim=1), mine.sum(dim=1), mine.shape[1])
-        chosen = first.gather(1, torch.arange(count, device=first.device) % many[:, None])
-        shapes.append(own.gather(1, chosen[..., None].expand(-1, -1, 3)))
-    return torch.stack(shapes, dim=1)

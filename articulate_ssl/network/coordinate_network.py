@@ -5,6 +5,7 @@ With labels it is the network of NPCS (`baselines.npcs`); without, fits teach it
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import roma
@@ -12,7 +13,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from articulate_ssl.geometry.se3 import se3, transform_points
 from articulate_ssl.network.surface_network import SurfaceCloud, SurfaceNetwork, SurfaceSize, layer
+from articulate_ssl.shape.part_poses import joint_states
 
 _START_WEIGHT = 1e-2
 
@@ -41,6 +44,27 @@ class WholeShape(NamedTuple):
     def rows(self, key) -> WholeShape:
         """Some of the clouds."""
         return WholeShape(*(x[key] for x in self))
+
+    def placed(
+        self,
+        pose: Tensor,  # [B, K, 4, 4] part space -> camera space
+        parent: Sequence[int],  # J parts
+        child: Sequence[int],  # J parts
+        joint_type: int,
+    ) -> dict[str, Tensor]:
+        """Object and joints, if parts are there: fields of `Prediction`; states are relative to rest."""
+        root = next(part for part in range(pose.shape[1]) if part not in child)
+        place, still = pose[:, parent], torch.eye(3).to(pose)
+        return {
+            "part_pose": pose,
+            "assembly": self.center,
+            "base_pose": pose[:, root] @ se3(still, -self.center[:, root]),
+            "joint_axis": (place[..., :3, :3] @ self.axis[..., None]).squeeze(-1),
+            "joint_pivot": transform_points(place, self.pivot[..., None, :]).squeeze(-2),
+            "joint_state": joint_states(pose, self.center, self.axis, parent, child, joint_type),
+            "canonical_axis": self.axis,
+            "canonical_pivot": self.pivot + self.center[:, parent],
+        }
 
 
 class CoordinateNetwork(SurfaceNetwork):

@@ -87,6 +87,12 @@ class SurfaceCloud(NamedTuple):
             share / share.sum(-1, keepdim=True),
         )
 
+    @staticmethod
+    def of_points(points: Tensor, size: SurfaceSize) -> SurfaceCloud:
+        """Of clouds [B, N, 3] whose surfaces are not looked at: it is known where points are, and no more."""
+        nothing = points.new_zeros(*points[:, : size.read].shape[:2], 1)
+        return SurfaceCloud.of(points, nothing.expand(-1, -1, SPIN_CHANNELS), nothing.expand(-1, -1, 3), size)
+
     def seen_in(self, frame: Tensor) -> SurfaceCloud:
         """Copies in frames [B, S, 3, 3] (frame -> camera): B S clouds, the copies of a cloud in a row."""
         copies = frame.shape[1]

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import roma
+import torch
 from torch import Tensor
 
 from articulate_ssl.geometry.screw import REVOLUTE
@@ -53,3 +54,19 @@ def nearest_on_line(
 ) -> Tensor:  # [..., 3]
     """The point of the joint line (pivot, axis) that is nearest to the origin: the one pivot that is well defined."""
     return pivot - (pivot * axis).sum(-1, keepdim=True) * axis
+
+
+def part_shapes(
+    coordinates: Tensor,  # [B, K, P, 3] of every point in every part's space
+    part_id: Tensor,  # [B, P]
+    count: int,
+) -> Tensor:  # [B, K, count, 3]
+    """Of every part the coordinates of its first points, over again if it has fewer; of one that has none, of all."""
+    shapes = []
+    for part, own in enumerate(coordinates.unbind(dim=1)):
+        mine = part_id == part
+        first = (~mine).to(torch.uint8).argsort(dim=1, stable=True)
+        many = torch.where(mine.any(dim=1), mine.sum(dim=1), mine.shape[1])
+        chosen = first.gather(1, torch.arange(count, device=first.device) % many[:, None])
+        shapes.append(own.gather(1, chosen[..., None].expand(-1, -1, 3)))
+    return torch.stack(shapes, dim=1)

@@ -23,7 +23,6 @@ from articulate_ssl.inference.prediction import Prediction, concatenate
 from articulate_ssl.network.coordinate_network import CoordinateNetwork
 from articulate_ssl.network.surface_network import SurfaceCloud
 from articulate_ssl.ops.progress import announced, tell
-from articulate_ssl.ops.spin_images import SPIN_CHANNELS, spin_images
 from articulate_ssl.shape.part_poses import nearest_on_line
 from articulate_ssl.training.explanations import registered_points
 
@@ -71,11 +70,10 @@ def learn_poses(
 
 @dataclass(frozen=True)
 class PoseLessons:
-    """n clouds, what is known of their surfaces, and how they were explained.
+    """n clouds, and how they were explained.
 
     Attributes:
         points: [n, M, 3] leading points.
-        surface: [n, M, SPIN_CHANNELS + 3] float16, spin images and normals.
         part_id: [n, M]
         pose: [n, K, 4, 4] part space -> camera space; its origin is the part's centre.
         center: [n, K, 3] in canonical object space.
@@ -85,7 +83,6 @@ class PoseLessons:
     """
 
     points: Tensor
-    surface: Tensor
     part_id: Tensor
     pose: Tensor
     center: Tensor
@@ -101,11 +98,8 @@ class PoseLessons:
     ) -> PoseLessons:
         """From predictions, which label the clouds' points."""
         count, parent = _SHOWN * SIZE.read, fits.joint_parent[0].tolist()
-        shown = announced(log, "poses, surfaces of clouds that teach", clouds.split(_CHUNK))
-        surface = torch.cat([torch.cat(spin_images(some[:, :count], some), dim=-1).half() for some in shown])
         return PoseLessons(
             clouds[:, :count],
-            surface,
             fits.dense_part_id[:, :count].long(),
             fits.part_pose,
             fits.assembly,
@@ -120,17 +114,16 @@ class PoseLessons:
         # In farthest-point order again, so that what is left after a layer is even.
         seen = torch.rand(BATCH, self.points.shape[1], generator=generator).argsort(dim=1)
         seen = seen[:, : SIZE.read].sort(dim=1).values
-        points, surface, part_id = (x[rows, seen] for x in (self.points, self.surface, self.part_id))
+        points, part_id = self.points[rows, seen], self.part_id[rows, seen]
         whole = (x[rows[:, 0]] for x in (self.pose, self.center, self.axis, self.pivot))
-        drawn = PoseLessons(points, surface.to(points), part_id, *whole, self.root)
+        drawn = PoseLessons(points, part_id, *whole, self.root)
         spread = torch.tensor(_TURNS)[torch.randint(len(_TURNS), (BATCH, 1), generator=generator)].deg2rad()
         turn = roma.rotvec_to_rotmat(spread * torch.randn(BATCH, 3, generator=generator)).to(points)
         return drawn, drawn.pose[:, self.root, :3, :3] @ turn
 
     def loss(self, network: CoordinateNetwork, frame: Tensor) -> Tensor:  # []
         """Of what a network says of these clouds, seen in frames [n, 3, 3]."""
-        images, normal = self.surface.split([SPIN_CHANNELS, 3], dim=-1)
-        seen = SurfaceCloud.of(self.points, images, normal, SIZE).seen_in(frame[:, None])
+        seen = SurfaceCloud.of_points(self.points, SIZE).seen_in(frame[:, None])
         said = network.look(seen)
         logits, coordinates = network.coordinates(seen, said)
         every = transform_points(invert_se3(self.pose), self.points[:, None])  # [n, K, N, 3]
