@@ -24,6 +24,7 @@ from articulate_ssl.shape.part_poses import part_shapes, rigid_fit
 
 SIZE = SurfaceSize(read=512, centers=256)
 _LOOKS = 2  # the second in the frame that the first led to
+_CHUNK = 4  # clouds of whose points it is asked at a time: what a CPU works on stays in cache
 _WEIGHINGS = 2  # after the first fit, points that it leaves far off count less
 
 
@@ -86,7 +87,9 @@ class PoseNetwork(nn.Module):
         """What is said of the whole clouds, and logits [B, P, K] and coordinates [B, K, P, 3] of their points."""
         seen = SurfaceCloud.of_points(dense, SIZE).seen_in(frame[:, None])
         said = self.network.look(seen)
-        return said, *self.network.coordinates(seen, said)
+        some = torch.arange(len(dense), device=dense.device).split(_CHUNK)
+        logits, coordinates = zip(*(self.network.coordinates(seen.rows(r), said.rows(r)) for r in some), strict=True)
+        return said, torch.cat(logits), torch.cat(coordinates)
 
     def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
         self.network = None

@@ -108,8 +108,12 @@ class CoordinateNetwork(SurfaceNetwork):
         by rotations: it corrects what the whole shape says.
         """
         B, N, _ = seen.points.shape
-        whole = said.whole[:, None].expand(-1, N, -1)
-        out = self.part_and_coordinates(self.point(torch.cat([seen.carried(said.local), seen.points, whole], dim=-1)))
+        # One layer of local features, coordinates, and those of the whole, each applied where there are few of them.
+        first, *deeper = self.point
+        local, place, whole = first.weight.split([said.local.shape[-1], 3, said.whole.shape[-1]], dim=1)
+        hidden = seen.carried(functional.linear(said.local, local)) + functional.linear(seen.points, place)
+        hidden = hidden + functional.linear(said.whole, whole, first.bias)[:, None]
+        out = self.part_and_coordinates(nn.Sequential(*deeper)(hidden))
         logits, correction = out.split([self.num_parts, 3 * self.num_parts], dim=-1)
         turned = torch.einsum("bni,bkij->bknj", seen.points, said.rotation)
         return logits, turned + said.shift[:, :, None] + correction.view(B, N, -1, 3).transpose(1, 2)

@@ -18,7 +18,7 @@ from torch.nn import functional
 from articulate_ssl.geometry.kernel_points import KernelPoints, symmetric_kernel_points
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.network.backbone import GroupConvolutionBlock
-from articulate_ssl.ops.neighborhood import Neighbors, correlate, nearest_neighbors
+from articulate_ssl.ops.neighborhood import Neighbors, correlate, nearest_indices, nearest_neighbors
 from articulate_ssl.ops.spin_images import SPIN_CHANNELS
 
 MODES = 60  # kernels are those of the icosahedral group
@@ -75,8 +75,9 @@ class SurfaceCloud(NamedTuple):
         """Of clouds [B, N, 3]; spin images and normals of the points that the first layer reads."""
         read, left = points[:, : size.read], points[:, : size.centers]
         # Shares by inverse distance, as in PointNet++; a point that is left takes all from itself.
-        square, near = torch.cdist(points, left).square().topk(min(3, left.shape[1]), largest=False)
-        share = 1 / (square + 1e-6)
+        near = nearest_indices(points, left, 3)
+        found = left.gather(1, near.flatten(1)[..., None].expand(-1, -1, 3)).unflatten(1, near.shape[1:])
+        share = 1 / ((found - points[:, :, None]).square().sum(-1) + 1e-6)
         return SurfaceCloud(
             points - read.mean(1, keepdim=True),
             normal,

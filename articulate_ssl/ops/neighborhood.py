@@ -70,15 +70,23 @@ def nearest_neighbors(
         raise ValueError(f"centers must be [{points.shape[0]}, M] indices of points, got {list(centers.shape)}")
     N = points.shape[1]
     queries = points if centers is None else points.gather(1, centers[..., None].expand(-1, -1, 3))
-    count = min(num_neighbors, N)
-    many = points.device.type == "cpu" and queries.shape[1] * N >= _TREE_FROM
-    # A tree takes no NaN.
-    search = _by_tree if many and torch.isfinite(points).all() else _by_tiles
-    index = search(queries, points, count)  # [B, M, n]
+    index = nearest_indices(queries, points, num_neighbors)
     neighbor = (
         points.transpose(1, 2).gather(2, index.flatten(1)[:, None].expand(-1, 3, -1)).unflatten(2, index.shape[1:])
     )
     return Neighbors(index, neighbor - queries.transpose(1, 2)[..., None], N)
+
+
+def nearest_indices(
+    queries: Tensor,  # [B, M, 3]
+    points: Tensor,  # [B, N, 3]
+    count: int,
+) -> Tensor:  # [B, M, min(count, N)] int64
+    """The nearest points of every query, in no particular order."""
+    many = points.device.type == "cpu" and queries.shape[1] * points.shape[1] >= _TREE_FROM
+    # A tree takes no NaN.
+    search = _by_tree if many and torch.isfinite(points).all() and torch.isfinite(queries).all() else _by_tiles
+    return search(queries, points, min(count, points.shape[1]))
 
 
 def _by_tree(queries: Tensor, points: Tensor, count: int) -> Tensor:  # [B, M, count]
