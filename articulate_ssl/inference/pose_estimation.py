@@ -214,9 +214,10 @@ class PoseEstimator:
         if not torch.isfinite(points).all():
             raise ValueError("a cloud has NaN or infinite points")
         found, rival = self._decided(points, num_points, refine, dense, fits)
-        if not fits or dense is None or not self.pose_network.learnt:
-            return found, rival
         registers = (self.inference.refine if refine is None else refine) is not False
+        # Similar views say parts, too, and better than posed shapes; whether better than this network was not asked.
+        if not fits or dense is None or not self.pose_network.learnt or (registers and self.view_search.learnt):
+            return found, rival
         says = self.pose_network.labelled if registers else self.pose_network.posed
         with torch.autocast(points.device.type, enabled=False):
             return says(found, points, dense), rival
