@@ -37,7 +37,7 @@ _TAUGHT = 0.9  # of them; the others say whether the network is right
 _TURNS = (8.0, 2.7)
 _LENGTHS = 10.0  # weight of lengths, which are about .05 where angles are 1 at the start
 _SHOWN = 2  # times as many points as the network reads are known, of which it reads some
-_DECAY, _GRADIENT_NORM = 1e-4, 1.0
+_WARM, _DECAY, _GRADIENT_NORM = 0.05, 1e-4, 1.0
 _CHUNK = 16  # clouds at a time
 
 log = logging.getLogger(__name__)
@@ -144,7 +144,8 @@ def teach(lessons: PoseLessons) -> CoordinateNetwork:
         torch.manual_seed(0)
         network = CoordinateNetwork(lessons.pose.shape[1], SIZE).to(lessons.points.device)
         optimizer = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=_DECAY)
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
+        # Smith and Topin 2018. With a cosine alone ovens' poses were 3.6 degrees off, so 2.5 (step 211).
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, steps, pct_start=_WARM)
         for _ in announced(log, "a network learns poses", range(steps)):
             drawn, frame = lessons.draw(generator)
             loss = drawn.loss(network, frame)

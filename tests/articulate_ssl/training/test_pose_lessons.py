@@ -83,10 +83,11 @@ def test_clouds_are_shown_near_their_frames_and_of_points_whose_parts_are_known(
     assert mine
 
 
-@pytest.mark.parametrize("times, kept", [(300, True), (1, False)])
-def test_it_is_kept_if_it_comes_nearer_to_fits_of_other_clouds(labels, monkeypatch, caplog, times, kept):
+@pytest.mark.parametrize("times, rate, kept", [(300, pose_lessons.RATE, True), (40, 1e-9, False)])
+def test_it_is_kept_if_it_comes_nearer_to_fits_of_other_clouds(labels, monkeypatch, caplog, times, rate, kept):
     monkeypatch.setattr(pose_lessons, "FEWEST", CLOUDS)
     monkeypatch.setattr(pose_lessons, "_TIMES", times)
+    monkeypatch.setattr(pose_lessons, "RATE", rate)
     module = _Module(labels)
     learn_poses(module, labels["dense_points"])
     assert module.estimator.pose_network.learnt == kept
