@@ -12,7 +12,7 @@ from articulate_ssl.discovery.synchronization import pairwise_costs, synchronise
 from articulate_ssl.geometry.rotation_group import rotation_group
 
 # Mean angle, in degrees, between normals and axes, in the median over the clouds. Procedural chests: .3 to .6 where few
-# points see a plane, 3.7 where many do, some of them across edges, 4.4 to 6 with noise of .01, and their frames are
+# points see a plane, 3.7 where many do, some of them across edges, 4.3 to 6 with noise up to .01, and their frames are
 # right (docs/experiments.md, step 208); 9.4 to 10 where there are no planes. Chosen in between.
 _LARGEST_ANGLE = 7.5
 

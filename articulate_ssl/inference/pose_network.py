@@ -1,11 +1,10 @@
-"""A network that says where the parts of a cloud are as precisely as fits do, which taught it, in one or two looks.
+"""A network that says where the parts of a cloud are nearly as precisely as the fits that taught it.
 
-The articulated network's hypotheses are six degrees off, as they are turned about so many ways and stretch one shape.
+The articulated network's hypotheses are some degrees off: they are turned in so many ways, and stretch one shape.
 Seen in the frame of the one that was decided for, a cloud stands nearly as all others do; there it is asked which part
 every point is of, and where in the part (`network.coordinate_network`). Poses follow from both at once, by Procrustes,
 and part shapes are the points themselves. It is taught by registered predictions of training clouds
-(`training/pose_lessons.py`), no label is read, and of points near the seams between parts it is right more often than
-they are. With spin images it was no better (docs/experiments.md, step 210).
+(`training/pose_lessons.py`), no label is read, and which part points are of it says more rightly than they do. With spin images it was no better (docs/experiments.md, step 210).
 """
 
 from __future__ import annotations

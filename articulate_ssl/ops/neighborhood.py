@@ -11,7 +11,7 @@ from articulate_ssl.ops.extreme_index import indices_of_smallest
 from articulate_ssl.ops.kd_tree import kd_tree
 
 _TILE_ELEMENTS = {"cpu": 2**16, "cuda": 2**27}  # distances held at a time: few enough to stay in cache on a CPU
-# Distances from which a tree is faster on a CPU: 512 x 256 by 2.6 times, 4096 x 1024 by twenty (step 210).
+# Distances from which a tree is faster on a CPU: 512 x 256 by 2.6 times, 4096 x 1024 by twenty (step 209).
 _TREE_FROM = 2**17
 KERNEL_RADIUS = 0.7  # kernel points lie within this fraction of the ball's radius
 INFLUENCE = 0.5  # sigma / radius^2, the squared distance at which a kernel point's influence ends
