@@ -4,7 +4,8 @@ The articulated network's hypotheses are some degrees off: they are turned in so
 Seen in the frame of the one that was decided for, a cloud stands nearly as all others do; there it is asked which part
 every point is of, and where in the part (`network.coordinate_network`). Poses follow from both at once, by Procrustes,
 and part shapes are the points themselves. It is taught by registered predictions of training clouds
-(`training/pose_lessons.py`), no label is read, and which part points are of it says more rightly than they do. With spin images it was no better (docs/experiments.md, step 210).
+(`training/pose_lessons.py`), no label is read; which part points are of it says more rightly than they do. With spin
+images it was no better (docs/experiments.md, step 210).
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ class PoseNetwork(nn.Module):
         super().__init__()
         self.num_parts = num_parts
         self.register_module("network", None)
+        self.register_buffer("like", torch.zeros(()), persistent=False)  # where, and of which type, weights are loaded
 
     @property
     def learnt(self) -> bool:
@@ -93,7 +95,7 @@ class PoseNetwork(nn.Module):
     def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
         self.network = None
         if any(name.startswith(f"{prefix}network.") for name in state_dict):
-            self.network = CoordinateNetwork(self.num_parts, SIZE).requires_grad_(False)
+            self.network = CoordinateNetwork(self.num_parts, SIZE).to(self.like).requires_grad_(False)
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
