@@ -48,7 +48,7 @@ def _run(args: argparse.Namespace) -> None:
     method = seeded(kind, problem, args.seed, args.steps)
     with shown():
         note = train(method, data, args.out, args.seed)
-        test(method, tested, report, note["seconds"])
+        test(method, tested, report, note)
 
 
 def _data(

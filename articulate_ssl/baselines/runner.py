@@ -44,6 +44,7 @@ from datamodules.shards import UNLABELLED_ARRAYS
 
 CHECKPOINT_NAME, WEIGHTS_NAME, NOTE_NAME = "last.ckpt", "weights.pt", "trained.json"
 SAVE_EVERY = 100  # steps; chosen: at most a minute is lost, and saving takes far less
+CPU = "CPU"  # as the device of a note
 TEST_SEED = 0  # of what predictions draw, e.g. in RANSAC
 
 # What each word of `Method.given` lets training see of a batch, beyond clouds.
@@ -102,7 +103,7 @@ def train(method: Method, data: ArticulatedDataModule, folder: Path, seed: int) 
         seed: Of everything that is drawn.
 
     Returns:
-        The note: `what` was trained, and `seconds` that it took, over all attempts.
+        The note: `what` was trained, the `seconds` that it took, over all attempts, and on which `device` it ended.
     """
     folder.mkdir(parents=True, exist_ok=True)
     what = _described(method, data, seed)
@@ -128,15 +129,22 @@ def train(method: Method, data: ArticulatedDataModule, folder: Path, seed: int) 
         _fit(method, data, last, keep)
     with atomic_write(folder / WEIGHTS_NAME) as file:
         torch.save(method.state_dict(), file)
-    finished = {"what": what, "seconds": keep.seconds}
+    finished = {"what": what, "seconds": keep.seconds, "device": _device_name()}
     _write(note, finished)
     for file in (last, started):
         file.unlink(missing_ok=True)
     return finished
 
 
-def test(method: Method, data: ArticulatedDataModule, folder: Path, train_seconds: float) -> dict[str, Any]:
-    """Score a trained method on the test clouds and write `metrics.json` and `metrics.csv`; returns their content."""
+def test(method: Method, data: ArticulatedDataModule, folder: Path, trained: dict[str, Any]) -> dict[str, Any]:
+    """Score a trained method on the test clouds and write `metrics.json` and `metrics.csv`; returns their content.
+
+    Args:
+        method: Trained.
+        data: Whose test clouds.
+        folder: Of what is written.
+        trained: What `train` returned.
+    """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     method.to(device).eval()
     data.setup("test")
@@ -161,7 +169,8 @@ def test(method: Method, data: ArticulatedDataModule, folder: Path, train_second
         given=list(method.given),
         says=list(method.says),
         parameters=_size(method),
-        train_seconds=train_seconds,
+        train_seconds=trained["seconds"],
+        trained_on=trained.get("device"),  # older notes have none
         part_names=list(manifest.part_names),
         calibration=calibration.to_dict(),
     )
@@ -182,6 +191,10 @@ def _described(method: Method, data: ArticulatedDataModule, seed: int) -> dict[s
     clouds = hashlib.sha256((data.folder / MANIFEST_NAME).read_bytes()).hexdigest()
     what = {"method": method.title, "parameters": _size(method), "problem": problem, "effort": effort}
     return what | {"seed": seed, "data": clouds}
+
+
+def _device_name() -> str:
+    return torch.cuda.get_device_name() if torch.cuda.is_available() else CPU
 
 
 def _size(method: Method) -> int:

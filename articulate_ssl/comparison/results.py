@@ -43,6 +43,7 @@ class RowResult:
         seeds: That are trained and tested.
         values: Of every (quantity, part or joint); `ALL` for their average. What the method does not say is missing.
         train_seconds: Mean over seeds; None if nothing is tested.
+        trained_on: The devices that methods were trained on, as far as that was noted.
         seconds_per_cloud: The same.
         parameters: That were learnt.
         printed: The paper's figures of this row.
@@ -52,6 +53,7 @@ class RowResult:
     seeds: tuple[int, ...] = ()
     values: dict[tuple[str, str], Estimate] = field(default_factory=dict)
     train_seconds: float | None = None
+    trained_on: tuple[str, ...] = ()
     seconds_per_cloud: float | None = None
     parameters: int | None = None
     printed: dict[str, float | list[float]] = field(default_factory=dict)
@@ -126,6 +128,7 @@ def _row_result(row: Row, seeds: tuple[int, ...], reports: list[dict[str, Any]],
         seeds,
         {key: value for key, value in values.items() if value is not None},
         fmean(report["train_seconds"] for report in reports),
+        tuple(sorted({report["trained_on"] for report in reports if report.get("trained_on")})),
         fmean(report["seconds_per_cloud"] for report in reports),
         reports[0]["parameters"],
         printed,

@@ -8,6 +8,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict
 
+from articulate_ssl.baselines.runner import CPU
 from articulate_ssl.comparison.results import ALL, Results, RowResult
 from articulate_ssl.comparison.statistics import Estimate
 from articulate_ssl.metrics.report import PERCENT
@@ -110,6 +111,7 @@ def as_json(results: Results) -> str:
             "given": list(result.row.given),
             "seeds": list(result.seeds),
             "train_seconds": result.train_seconds,
+            "trained_on": list(result.trained_on),
             "seconds_per_cloud": result.seconds_per_cloud,
             "parameters": result.parameters,
             "values": [
@@ -127,11 +129,16 @@ def as_json(results: Results) -> str:
 def _unfolded(result: RowResult, revolute: bool) -> list[str]:
     numbers = [_with_interval(result.value(quantity), quantity, digits) for quantity, digits in _quantities(revolute)]
     about = (
-        NOTHING if result.train_seconds is None else f"{result.train_seconds:.0f}",
+        NOTHING if result.train_seconds is None else f"{result.train_seconds:.0f}" + _elsewhere(result),
         NOTHING if result.seconds_per_cloud is None else f"{result.seconds_per_cloud:.3f}",
         NOTHING if result.parameters is None else f"{result.parameters:,}".replace(",", " "),
     )
     return [result.row.title, given(result), str(len(result.seeds)), *numbers, *about]
+
+
+def _elsewhere(result: RowResult) -> str:
+    """What seconds of a training are of, if not of CPUs alone."""
+    return f" ({', '.join(result.trained_on)})" if set(result.trained_on) - {CPU} else ""
 
 
 def _each_seed(result: RowResult, revolute: bool) -> list[str]:

@@ -43,7 +43,7 @@ class OrientationRange:
         """Whether rotations are within the range."""
         if not self.limited:
             return torch.ones(rotation.shape[:-2], dtype=torch.bool, device=rotation.device)
-        identity = torch.eye(3).to(rotation).expand_as(rotation)
+        identity = torch.eye(3, dtype=rotation.dtype, device=rotation.device).expand_as(rotation)
         return roma.rotmat_geodesic_distance(rotation, identity).rad2deg() <= self.degrees
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:

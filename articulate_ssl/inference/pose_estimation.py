@@ -34,6 +34,7 @@ import torch
 from torch import Tensor
 
 from articulate_ssl.discovery.registration import chamfer_l1
+from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
 from articulate_ssl.inference.candidates import (
     ANOTHER_WAY,
@@ -68,6 +69,7 @@ from articulate_ssl.network.heads.shape import CanonicalShape
 from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.network.rigid_alignment import RigidAlignment
 from articulate_ssl.ops.chamfer import hypothesis_distances
+from articulate_ssl.ops.replay import Replay
 from articulate_ssl.shape.observation import Observation
 
 # Of the width of a joint's range: registration, before proportions, leaves doors 10 degrees off and more. Chosen.
@@ -127,6 +129,7 @@ class PoseEstimator:
         self.front_ends = FrontEnds(articulated.num_parts - 1)
         self.pose_network = PoseNetwork(articulated.num_parts)
         self.observation = replace(observation, camera=self.hinge_sides.camera)
+        self._replay = Replay(self._weights, _copied)
         self.registration = HypothesisRegistration(inference, self.observation, self.states)
         self.decision = Decision(articulated, self.registration, self.two_ways)
         self.final = FinalFit(
@@ -149,7 +152,7 @@ class PoseEstimator:
     def align(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Stage 0: clouds turned roughly to canonical orientation [B, N, 3], and the pose [B, 4, 4] that undoes it."""
         if self.rigid is None:
-            return points, torch.eye(4).to(points).expand(len(points), 4, 4)
+            return points, torch.eye(4, dtype=points.dtype, device=points.device).expand(len(points), 4, 4)
         with torch.no_grad():
             hypotheses = self.rigid(points)
             distance = hypothesis_distances(points, hypotheses.posed(), bidirectional=self.observation.bidirectional)
@@ -161,12 +164,20 @@ class PoseEstimator:
     def iterate(
         self,
         points: Tensor,  # [B, N, 3] aligned
+        chain: KinematicChain | None = None,
+        observation: Observation | None = None,
     ) -> Iterator[Iteration]:
-        """Pose estimations, each from the winner of the one before."""
+        """Pose estimations, each from the winner of the one before.
+
+        Args:
+            chain: The category's, if it was asked for already.
+            observation: `Observation.known`, if it was.
+        """
         start, labels = None, None
+        chain, observation = chain or self.articulated.category.chain(), observation or self.observation
         for number in range(self.iterations):
-            hypotheses = self.articulated(points, start, labels)
-            iteration = Iteration(points, hypotheses, start, self.observation, self.agreement, self.compared)
+            hypotheses = self.articulated(points, start, labels, chain)
+            iteration = Iteration(points, hypotheses, start, observation, self.agreement, self.compared)
             yield iteration
             if number + 1 < self.iterations:
                 start = hypotheses.select(iteration.winner)
@@ -366,15 +377,39 @@ class PoseEstimator:
         Args:
             turn: Of those, hypotheses that are not turned about so are registered only where too few are.
         """
-        aligned, pose = self.align(points[:, :num_points])
-        *_, last = self.iterate(aligned)
         if registers:
+            aligned, pose = self.align(points[:, :num_points])
+            *_, last = self.iterate(aligned)
             turn = None if turn is None else pose[:, :3, :3].mT @ turn
             candidates, error = self.registration.leading(last, transform_points(invert_se3(pose), points), turn)
         else:
-            candidates, error = last.hypotheses, last.distance
+            candidates, error, pose = self._proposed(points[:, :num_points])
         candidates = candidates.at(pose[:, None] @ candidates.base, candidates.state)
         return Candidates(error, candidates.base, candidates.state, candidates.select)
+
+    def _proposed(
+        self,
+        points: Tensor,  # [B, N, 3]
+    ) -> tuple[Hypotheses, Tensor, Tensor]:  # [B, H], [B, 4, 4]
+        """What the networks say: hypotheses in the aligned frame, their errors, and the pose of that frame."""
+        chain, observation = self.articulated.category.chain(), self.observation.known()
+
+        def proposed(clouds: Tensor) -> tuple[Hypotheses, Tensor, Tensor]:
+            aligned, pose = self.align(clouds)
+            *_, last = self.iterate(aligned, chain, observation)
+            return last.hypotheses, last.distance, pose
+
+        if observation.camera is not None:  # which way is up is read on the host
+            return proposed(points)
+        network = self.articulated
+        how = self.agreement, self.compared, network.shape_head.freedom, network.mixed_precision, network.training
+        return self._replay(proposed, points, (chain, *how))
+
+    def _weights(self) -> Iterator[Tensor]:
+        """All tensors that the networks read."""
+        for network in filter(None, (self.articulated, self.rigid)):
+            yield from network.parameters()
+            yield from network.buffers()
 
     def _slid(
         self,
@@ -498,3 +533,10 @@ class PoseEstimator:
         neighbours = self.inference.part_neighbours or 1
         distance = self.final.distance(chosen, points)
         return as_prediction(chosen, points, distance, margin, self.posterior_scale, neighbours, votes, dense)
+
+
+def _copied(proposed: tuple[Hypotheses, Tensor, Tensor]) -> tuple[Hypotheses, Tensor, Tensor]:
+    """See `PoseEstimator._proposed`."""
+    hypotheses, error, pose = proposed
+    every = torch.arange(len(error), device=error.device)
+    return hypotheses.rows(every), error.clone(), pose.clone()

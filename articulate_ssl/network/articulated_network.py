@@ -66,6 +66,7 @@ class ArticulatedNetwork(nn.Module):
         points: Tensor,  # [B, N, 3], roughly aligned (stage 0) camera space
         estimate: Hypotheses | None = None,  # the previous iteration's winner (H = 1)
         labels: Tensor | None = None,  # [B, N] parts by that estimate
+        chain: KinematicChain | None = None,  # the category's, if it was asked for already
     ) -> Hypotheses:
         """Hypotheses for every group element and start of the joint states.
 
@@ -77,7 +78,7 @@ class ArticulatedNetwork(nn.Module):
         logits, equivariant = self._part_features(points, mean)
         invariant = self.part_pool(equivariant)
 
-        chain = self.category.chain()
+        chain = chain or self.category.chain()
         shape = self.shape_head(invariant, self.category)
         structure = self._structure(equivariant, invariant, chain)
         base, state = self.pose_head(equivariant, chain, mean, residual=estimate is not None)
@@ -101,7 +102,7 @@ class ArticulatedNetwork(nn.Module):
     ) -> Hypotheses:
         """The category's own shape and joints at poses: hypotheses that nothing was read from a cloud for."""
         category, chain, (clouds, count) = self.category, self.category.chain(), base.shape[:2]
-        canonical, pair = category.canonical(), pair_of_joints(chain, category.pairs)
+        canonical, pair = category.canonical(), pair_of_joints(chain)
         pair_axis = canonical.axis.expand(clouds, count, -1, -1)
         pair_pivot = canonical.pivot.expand(clouds, -1, -1)
         shape = CanonicalShape(category.template.expand(clouds, -1, -1, -1), category.assembly.expand(clouds, -1, -1))
@@ -135,8 +136,10 @@ class ArticulatedNetwork(nn.Module):
         """Joint lines of all part pairs, and of the chain."""
         confidence, pair_pivot = self.pair_head(invariant, self.category)
         pair_axis = self.axis_head(equivariant, self.category)
-        joint_pair = pair_of_joints(chain, self.category.pairs)
-        pivot, axis = pair_pivot[:, joint_pair], pair_axis[:, :, joint_pair]
+        # Not by a list of indices, which would have to be taken to the device.
+        joint_pair = pair_of_joints(chain)
+        pivot = torch.stack([pair_pivot[:, pair] for pair in joint_pair], dim=1)
+        axis = torch.stack([pair_axis[:, :, pair] for pair in joint_pair], dim=2)
         if self.shared_axis:
             axis = axis[:, :, :1].expand_as(axis)
         return Structure(confidence, pair_pivot, pair_axis, pivot, axis, chain, self.joint_type)

@@ -79,7 +79,7 @@ class CategoryObject(nn.Module):
 
         Where all joints have one, networks read that of the first, and nothing holds those of the others.
         """
-        axis = functional.normalize(self.axis[pair_of_joints(self.chain(), self.pairs)], dim=-1)
+        axis = functional.normalize(self.axis[pair_of_joints(self.chain())], dim=-1)
         return axis[:1].expand_as(axis) if self.shared_axis else axis
 
     @torch.no_grad()
@@ -87,7 +87,7 @@ class CategoryObject(nn.Module):
         """The category's own shape with the joints of its chain; what `adopt` took over comes back, but thinned."""
         canonical, chain = self.canonical(), self.chain()
         label = torch.arange(self.num_parts, device=self.template.device).repeat_interleave(self.template.shape[1])
-        pair = pair_of_joints(chain, self.pairs)
+        pair = pair_of_joints(chain)
         return ArticulatedShape(
             canonical.shape.flatten(0, 1), label, Joints(chain, self.joint_axis(), canonical.pivot[pair], joint_type)
         )
@@ -122,7 +122,7 @@ class CategoryObject(nn.Module):
         """Let joints turn about lines elsewhere; at `state` all parts stay where they are."""
         joints = self.articulated_shape(REVOLUTE).joints
         moved, displaced = joints.with_lines_moved(shift, state)
-        self.pivot[pair_of_joints(joints.chain, self.pairs)] = moved.pivot
+        self.pivot[pair_of_joints(joints.chain)] = moved.pivot
         self.assembly += displaced
 
     @torch.no_grad()
@@ -131,7 +131,7 @@ class CategoryObject(nn.Module):
         axis: Tensor,  # [J, 3] unit
     ) -> None:
         """Let joints turn about these directions, through the same points."""
-        self.axis[pair_of_joints(self.chain(), self.pairs)] = axis.to(self.axis)
+        self.axis[pair_of_joints(self.chain())] = axis.to(self.axis)
 
     @torch.no_grad()
     def adopt(self, shape: ArticulatedShape) -> None:
@@ -146,7 +146,7 @@ class CategoryObject(nn.Module):
             self.template[part] = thinned - center
             self.principal_axes[part] = principal_directions(thinned)
         self.confidence.zero_()
-        for j, pair in enumerate(pair_of_joints(shape.joints.chain, self.pairs)):
+        for j, pair in enumerate(pair_of_joints(shape.joints.chain)):
             self.axis[pair] = shape.joints.axis[j]
             self.pivot[pair] = shape.joints.pivot[j]
             self.confidence[pair] = _FOUND

@@ -8,7 +8,7 @@ import roma
 import torch
 from torch import Tensor
 
-from articulate_ssl.geometry.kinematic_chain import KinematicChain
+from articulate_ssl.geometry.kinematic_chain import KinematicChain, pair_index
 from articulate_ssl.geometry.screw import REVOLUTE, screw_motion
 
 
@@ -79,9 +79,9 @@ class Joints:
         return state if self.limits is None else state.clamp(*self.limits.unbind(-1))
 
 
-def pair_of_joints(chain: KinematicChain, pairs: Tensor) -> list[int]:
-    """For every joint the row of `pairs` [E, 2] (see `pair_index`) that names the two parts it connects."""
-    index = {tuple(pair): e for e, pair in enumerate(pairs.tolist())}
+def pair_of_joints(chain: KinematicChain) -> list[int]:
+    """For every joint the row of `pair_index` that names the two parts it connects."""
+    index = {tuple(pair): e for e, pair in enumerate(pair_index(chain.num_parts).tolist())}
     return [index[min(p, c), max(p, c)] for p, c in zip(chain.parent, chain.child, strict=True)]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from torch import Tensor
@@ -40,6 +40,10 @@ class Observation:
     def bidirectional(self) -> bool:
         """Whether a hypothesis pays for what the cloud lacks, too."""
         return not self.unidirectional
+
+    def known(self) -> Observation:
+        """The same, without a camera if that has not learnt which way is up."""
+        return self if self.camera is None or self.camera.learnt else replace(self, camera=None)
 
     def allows(
         self,

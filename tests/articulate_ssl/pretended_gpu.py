@@ -6,6 +6,10 @@
 
 What a GPU refuses is refused: operations on tensors of both devices (but scalars, and indices in the host's memory),
 and numpy's view of a tensor. Values are those of the CPU. Gradients and optimisers are not pretended.
+
+    with pretended_gpu(), pretended_recording(): ...
+
+refuses, too, what a GPU refuses while a CUDA graph is recorded: to read a value on the host, or to take one from there.
 """
 
 from __future__ import annotations
@@ -23,6 +27,11 @@ from torch.utils._pytree import tree_flatten
 GPU, CPU = torch.device("cuda", 0), torch.device("cpu")
 _MARK = "pretended_device"  # attribute of a storage
 _MOVES = {"to", "cuda", "cpu"}
+# What a recording refuses.
+_READS = {"tolist", "item", "numpy", "__array__", "nonzero", "unique", "masked_select", "__contains__"} | {
+    f"__{kind}__" for kind in ("bool", "float", "int", "index")
+}
+_FROM_HOST = {"tensor", "as_tensor", "new_tensor"}
 # Operations that take tensors of both devices.
 _BETWEEN = {"copy_", "__set__", "_has_compatible_shallow_copy_type"}
 
@@ -36,6 +45,42 @@ def pretended_gpu() -> Iterator[None]:
         patch("torch.cuda.current_device", lambda: 0),
     ):
         yield
+
+
+@contextmanager
+def pretended_recording() -> Iterator[None]:
+    """See the module."""
+    with _PretendedRecording():
+        yield
+
+
+class _PretendedRecording(TorchFunctionMode):
+    def __torch_function__(
+        self, function: Callable, types: Any, args: tuple = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        kwargs = dict(kwargs or {})
+        name = getattr(function, "__name__", "")
+        tensors = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, Tensor)]
+        on_gpu = [_PretendedGpu._device(x) == GPU for x in tensors]
+        if any(on_gpu) and (name in _READS or (name in ("__getitem__", "__setitem__") and self._is_sought(args[1]))):
+            raise RuntimeError(f"{name}: reads a value on the host, or takes one from there, in a recording")
+        if name in _FROM_HOST and (any(on_gpu) or _as_device(kwargs.get("device")) == GPU):
+            raise RuntimeError(f"{name}: takes a value from the host in a recording")
+        out = function(*args, **kwargs)
+        between = name in _MOVES or name in _BETWEEN
+        if between and len({*on_gpu, *(_PretendedGpu._device(x) == GPU for x in (out,) if isinstance(x, Tensor))}) > 1:
+            raise RuntimeError(f"{name}: from one device to the other in a recording")
+        return out
+
+    @staticmethod
+    def _is_sought(index: Any) -> bool:
+        """Whether an index is of the host, or says by values how many there are."""
+        for x in index if isinstance(index, tuple) else (index,):
+            if isinstance(x, list | bool):
+                return True
+            if isinstance(x, Tensor) and x.dim() and (x.dtype == torch.bool or _PretendedGpu._device(x) == CPU):
+                return True
+        return False
 
 
 class _PretendedGpu(TorchFunctionMode):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tiny import POINTS, tiny_module
 from twins import assert_same_as_twin, relative_error
 
 from articulate_ssl.geometry.directions import icosahedron_directions, kernel_orbits
@@ -127,3 +128,18 @@ def test_spin_images_are_those_of_the_cpu():
     expected, _ = spin_images(points[:, :100], points)
     found, _ = spin_images(points[:, :100].cuda(), points.cuda())
     assert ((found.cpu() - expected).abs().amax(-1) < 0.02).float().mean() > 0.98
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("recipe", ["paper", "staged"])
+def test_replayed_proposals_are_those_of_the_first_time(recipe):
+    module = tiny_module(recipe=recipe).eval().cuda()
+    module.num_points = POINTS
+    generator = torch.Generator().manual_seed(0)
+    clouds = [torch.rand(1, POINTS, 3, generator=generator).cuda() for _ in range(4)]
+    replayed = [module.predict_points(cloud, refine=False).part_pose for cloud in clouds]
+    assert len(module.estimator._replay._recordings) == 1
+    for cloud, pose in zip(clouds, replayed, strict=True):
+        module.estimator._replay._asked = None
+        module.estimator._replay._recordings.clear()
+        torch.testing.assert_close(module.predict_points(cloud, refine=False).part_pose, pose, atol=1e-4, rtol=0)

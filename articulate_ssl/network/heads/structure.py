@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from articulate_ssl.geometry.kinematic_chain import KinematicChain
+from articulate_ssl.geometry.kinematic_chain import KinematicChain, pair_index
 from articulate_ssl.network.category_object import CategoryObject
 from articulate_ssl.network.heads.perceptron import perceptron
 from articulate_ssl.network.options import NetworkOptions
@@ -80,6 +80,7 @@ class PairHead(nn.Module):
         super().__init__()
         dim, num_pairs = options.head_dim, num_parts * (num_parts - 1) // 2
         self.perceptron = nn.ModuleList(perceptron(4 * dim, dim, 4) for _ in range(num_pairs))
+        self.pairs = pair_index(num_parts).tolist()
 
     def forward(
         self,
@@ -87,6 +88,6 @@ class PairHead(nn.Module):
         category: CategoryObject,
     ) -> tuple[Tensor, Tensor]:  # [B, E] and [B, E, 3]
         """Confidences and pivots."""
-        both = [torch.cat([invariant[:, i], invariant[:, j]], dim=-1) for i, j in category.pairs.tolist()]
+        both = [torch.cat([invariant[:, i], invariant[:, j]], dim=-1) for i, j in self.pairs]
         out = torch.stack([head(x) for head, x in zip(self.perceptron, both, strict=True)], dim=1)
         return category.confidence + out[..., 0], category.pivot + out[..., 1:]

@@ -25,7 +25,7 @@ def test_a_perfect_oracle_scores_zero(tmp_path, joint_type, labelled_spaces):
     method, data = LookUp(problem(POINTS, joint_type)), _data(tmp_path)
     method.labelled_spaces = labelled_spaces
     method.prepare(data, seed=0)
-    result = runner.test(method, data, tmp_path / "report", train_seconds=0.0)
+    result = runner.test(method, data, tmp_path / "report", trained={"seconds": 0.0, "device": runner.CPU})
     for name in ("r_err_deg", "t_err", "axis_err_deg", "state_err", "chamfer_l1", "legacy_r_err_deg", "legacy_t_err"):
         assert result[name]["mean"] < 1e-4, name
     assert (result["pivot_err"]["mean"] or 0.0) < 1e-4
@@ -37,7 +37,9 @@ def test_a_perfect_oracle_scores_zero(tmp_path, joint_type, labelled_spaces):
 def test_a_constant_scores_chance(tmp_path):
     """Of a uniformly random rotation, P(angle <= x) = (x - sin x) / pi; the cosine of a random direction is uniform."""
     write_synthetic_set(tmp_path, points=POINTS, states=20, rotations=25)
-    result = runner.test(Constant(problem(POINTS)), _data(tmp_path), tmp_path / "report", train_seconds=0.0)
+    result = runner.test(
+        Constant(problem(POINTS)), _data(tmp_path), tmp_path / "report", trained={"seconds": 0.0, "device": runner.CPU}
+    )
     assert result["samples"] == 1000
 
     def share_above(degrees: float) -> float:

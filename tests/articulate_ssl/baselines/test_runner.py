@@ -84,10 +84,12 @@ def test_other_options_do_not_go_on_from_what_is_there(root, tmp_path, monkeypat
 
 def test_the_report_says_what_was_tested(root, tmp_path):
     method, note = _trained(root, tmp_path)
-    runner.test(method, _data(root), tmp_path, note["seconds"])
+    runner.test(method, _data(root), tmp_path, note)
     report = json.loads((tmp_path / "metrics.json").read_text())
     assert report["method"] == "shells" and report["given"] == ["part labels"] and report["says"] == ["segmentation"]
-    assert report["train_seconds"] == note["seconds"] and report["seconds_per_cloud"] > 0
+    assert (report["train_seconds"], report["trained_on"]) == (note["seconds"], runner.CPU) and report[
+        "seconds_per_cloud"
+    ] > 0
     assert report["parameters"] == 12 * 32 + 32 + 32 * 2 + 2
     assert report["samples"] == 16
 

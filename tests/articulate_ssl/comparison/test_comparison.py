@@ -243,6 +243,17 @@ def test_the_tables_hold_what_the_reports_and_the_paper_say(tmp_path, programs, 
     assert matplotlib.image.imread(build / "laptop-complete.png").std() > 0
 
 
+def test_seconds_of_a_gpu_are_told_apart(tmp_path, programs, monkeypatch):
+    (tmp_path / "data" / "laptop" / "procedural-complete").mkdir(parents=True)
+    (tmp_path / "data" / "laptop" / "procedural-complete" / "manifest.json").touch()
+    options = ["--build", str(tmp_path / "build"), "--root", str(tmp_path / "data"), "--methods", "nsd"]
+    report = _report()
+    for device, seconds in (("CPU", "60"), ("NVIDIA H200", "60 (NVIDIA H200)")):
+        monkeypatch.setattr(Job, "report", lambda _job, _column, on=device: report | {"trained_on": on})
+        assert command.main(options) == 0
+        assert f"| {seconds} | 0.500 |" in (tmp_path / "build" / "laptop-complete.md").read_text()
+
+
 def test_trainings_are_tested_on_other_objects_too(tmp_path, programs, capsys):
     for source in ("procedural", "partnet-mobility"):
         (folder := tmp_path / "data" / "laptop" / f"{source}-complete").mkdir(parents=True)
