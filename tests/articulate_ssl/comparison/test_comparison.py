@@ -246,7 +246,7 @@ def test_the_tables_hold_what_the_reports_and_the_paper_say(tmp_path, programs, 
 def test_seconds_of_a_gpu_are_told_apart(tmp_path, programs, monkeypatch):
     (tmp_path / "data" / "laptop" / "procedural-complete").mkdir(parents=True)
     (tmp_path / "data" / "laptop" / "procedural-complete" / "manifest.json").touch()
-    options = ["--build", str(tmp_path / "build"), "--root", str(tmp_path / "data"), "--methods", "nsd"]
+    options = ["--build", str(tmp_path / "build"), "--root", str(tmp_path / "data"), "--methods", "oracle_epn"]
     report = _report()
     for device, seconds in (("CPU", "60"), ("NVIDIA H200", "60 (NVIDIA H200)")):
         monkeypatch.setattr(Job, "report", lambda _job, _column, on=device: report | {"trained_on": on})
