@@ -203,7 +203,7 @@ class PoseEstimator:
         Raises:
             ValueError: if a cloud has NaN or infinite points.
         """
-        return self.predict_with_rivals(points, num_points, refine, dense)[0]
+        return self._predicted(points, num_points, refine, dense, fits=True, rivals=False)[0]
 
     @torch.no_grad()
     def predict_with_rivals(
@@ -222,9 +222,15 @@ class PoseEstimator:
         Raises:
             ValueError: if a cloud has NaN or infinite points.
         """
+        return self._predicted(points, num_points, refine, dense, fits, rivals=True)
+
+    def _predicted(
+        self, points: Tensor, num_points: int, refine: bool | None, dense: Tensor | None, fits: bool, rivals: bool
+    ) -> tuple[Prediction, Prediction]:
+        """See `predict_with_rivals`; without `rivals` the second is of no use."""
         if not torch.isfinite(points).all():
             raise ValueError("a cloud has NaN or infinite points")
-        found, rival = self._decided(points, num_points, refine, dense, fits)
+        found, rival = self._decided(points, num_points, refine, dense, fits, rivals)
         registers = (self.inference.refine if refine is None else refine) is not False
         # Similar views say parts, too, and better than posed shapes; whether better than this network was not asked.
         if not fits or dense is None or not self.pose_network.learnt or (registers and self.view_search.learnt):
@@ -234,10 +240,10 @@ class PoseEstimator:
             return says(found, points, dense), rival
 
     def _decided(
-        self, points: Tensor, num_points: int, refine: bool | None, dense: Tensor | None, fits: bool
+        self, points: Tensor, num_points: int, refine: bool | None, dense: Tensor | None, fits: bool, rivals: bool
     ) -> tuple[Prediction, Prediction]:
-        """See `predict_with_rivals`: before a network says poses."""
-        *seen, error = self._explained(points, num_points, refine, dense, fits)
+        """See `_predicted`: before a network says poses."""
+        *seen, error = self._explained(points, num_points, refine, dense, fits, rivals)
         if self.hinge_sides.learnt:
             seen = [self.hinge_sides.counted_from_closed(one) for one in seen]
             seen[0], quarters = self.hinge_sides.decided(seen[0], dense)
@@ -246,7 +252,7 @@ class PoseEstimator:
         if not self.handedness.learnt:
             return tuple(seen)
         dense = None if dense is None else in_the_mirror(dense)
-        *other, mirrored = self._explained(in_the_mirror(points), num_points, refine, dense, fits)
+        *other, mirrored = self._explained(in_the_mirror(points), num_points, refine, dense, fits, rivals)
         return self.handedness.likelier(seen, other, self.handedness.log_odds(error, mirrored))
 
     @torch.no_grad()
@@ -257,12 +263,12 @@ class PoseEstimator:
     ) -> tuple[Tensor, Tensor]:  # [B], [B]
         """Errors of predictions, and of those of the clouds' mirror images, from which `handedness` learns."""
         seen = (points, in_the_mirror(points))
-        return tuple(self._explained(some, num_points, None, None, fits=False)[2] for some in seen)
+        return tuple(self._explained(some, num_points, None, None, False, False)[2] for some in seen)
 
     def _explained(
-        self, points: Tensor, num_points: int, refine: bool | None, dense: Tensor | None, fits: bool
+        self, points: Tensor, num_points: int, refine: bool | None, dense: Tensor | None, fits: bool, rivals: bool
     ) -> tuple[Prediction, Prediction, Tensor]:
-        """See `predict_with_rivals`: by the category's own hand; and the errors [B] before proportions.
+        """See `_predicted`: by the category's own hand; and the errors [B] before proportions.
 
         Proportions make up for the wrong hand.
         """
@@ -276,8 +282,8 @@ class PoseEstimator:
                 if self.view_search.parts is not None and self.object_frame.learnt and dense is not None:
                     turn = (chosen.base[:, 0, :3, :3] @ self.object_frame.axes).mT
                     votes = self.view_search.parts.beside(votes, dense, turn)
-            rival = self._packaged(other, points, torch.zeros_like(margin))
             found = self._packaged(chosen, points, margin, votes, dense)
+            rival = self._packaged(other, points, torch.zeros_like(margin)) if rivals else found
             square = self.object_frame.learnt and self.front_ends.learnt
             if registers and fits and square and dense is not None:
                 category = self.articulated.category.articulated_shape(self.articulated.joint_type)

@@ -74,6 +74,6 @@ def test_labels_beat_shuffled_labels(tmp_path):
         data, folder = _data(tmp_path, kind), tmp_path / kind.__name__
         method = runner.seeded(States, problem(POINTS), seed=0)
         note = runner.train(method, data, folder, seed=0)
-        errors.append(runner.test(method, data, folder, note["seconds"])["state_err"]["mean"])
+        errors.append(runner.test(method, data, folder, note)["state_err"]["mean"])
     honest, shuffled = errors
     assert honest < 13 < 15 < shuffled  # degrees; chance is 18.6
