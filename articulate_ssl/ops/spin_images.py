@@ -22,6 +22,7 @@ FACES = (0.016, 0.01, 0.007)
 HEIGHTS = (-0.07, -0.05, -0.036, -0.026, -0.019, -0.014, -0.01, -0.007, -0.0045, -0.002)
 HEIGHTS = (*HEIGHTS, 0.0, 0.002, 0.0045, 0.007, 0.01, 0.016, 0.03)
 LEAST = 6  # points that a plane is fitted to; fewer leave the plane as it was, or the image empty
+_MOST_PLANES = 2**15  # that a GPU fits at a time: cuSOLVER fails at 65,536 matrices (docs/experiments.md, step 213)
 RINGS = (0.0, 0.5, 1.0)  # shares of the radius
 SPIN_CHANNELS = len(HEIGHTS) * (len(RINGS) - 1)
 
@@ -43,7 +44,7 @@ def spin_images(
     if cloud.shape[1] < points.shape[1]:
         cloud = points
     centers = torch.arange(points.shape[1], device=points.device).expand(len(points), -1)
-    samples = 1 if points.device.type == "cpu" else len(points)
+    samples = 1 if points.device.type == "cpu" else max(1, _MOST_PLANES // points.shape[1])
     found = [
         _images(nearest_neighbors(some, NEIGHBORS, at).offset)
         for some, at in zip(cloud.split(samples), centers.split(samples), strict=True)

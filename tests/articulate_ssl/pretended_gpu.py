@@ -27,6 +27,7 @@ from torch.utils._pytree import tree_flatten
 GPU, CPU = torch.device("cuda", 0), torch.device("cpu")
 _MARK = "pretended_device"  # attribute of a storage
 _MOVES = {"to", "cuda", "cpu"}
+_MOST_MATRICES = 65535  # of which eigenvectors are asked at once; with one more an H200's cuSOLVER failed
 # What a recording refuses.
 _READS = {"tolist", "item", "numpy", "__array__", "nonzero", "unique", "masked_select", "__contains__"} | {
     f"__{kind}__" for kind in ("bool", "float", "int", "index")
@@ -98,6 +99,8 @@ class _PretendedGpu(TorchFunctionMode):
         devices = {self._device(x) for x in tensors if not self._is_scalar(x)}
         if name in ("numpy", "__array__") and GPU in devices:
             raise TypeError("can't convert cuda:0 device type tensor to numpy")
+        if name == "linalg_eigh" and GPU in devices and args[0].shape[:-2].numel() > _MOST_MATRICES:
+            raise RuntimeError("cusolver error: CUSOLVER_STATUS_INTERNAL_ERROR")
         if name == "__getitem__" and self._device(args[0]) == GPU:
             devices = {GPU}
         if len(devices) > 1 and name not in _BETWEEN:

@@ -7,6 +7,7 @@ import torch
 from pretended_gpu import pretended_gpu
 from tiny import POINTS, tiny_module
 
+from articulate_ssl.ops.spin_images import spin_images
 from articulate_ssl.training.checkpoint import load_module
 from articulate_ssl.training.shipped_weights import WEIGHTS_FOLDER
 
@@ -31,6 +32,17 @@ def test_the_pretence_refuses_what_a_gpu_refuses():
         with pytest.raises(TypeError, match="to numpy"):
             there.numpy()
     assert there.device.type == "cpu"
+
+
+def test_surfaces_of_many_clouds():
+    clouds = torch.rand(65, 1024, 3, generator=torch.Generator().manual_seed(0))
+    with pretended_gpu():
+        there = clouds.to("cuda")
+        with pytest.raises(RuntimeError, match="cusolver"):
+            torch.linalg.eigh(torch.eye(3, device=there.device).expand(2**16, -1, -1))
+        images, normal = spin_images(there, there)
+    expected = spin_images(clouds, clouds)
+    torch.testing.assert_close((images, normal), expected, atol=2e-3, rtol=0)
 
 
 @pytest.mark.parametrize("recipe", ["paper", "staged"])
