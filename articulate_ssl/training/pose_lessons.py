@@ -131,7 +131,8 @@ class PoseLessons:
         off = (coordinates.gather(1, own) - every.gather(1, own)).norm(dim=-1).mean()
         turned = (said.rotation - frame[:, None].mT @ self.pose[..., :3, :3]).square().sum((-1, -2)).mean()
         lengths = (said.center - self.center).norm(dim=-1).mean() + (said.pivot - self.pivot).norm(dim=-1).mean()
-        lines = (said.axis - self.axis).norm(dim=-1).mean()
+        # Squared: an axis is nearly the same in every cloud, and a distance pulls as hard at what is nearly right.
+        lines = (said.axis - self.axis).square().sum(-1).mean()
         segmentation = functional.cross_entropy(logits.flatten(0, 1), self.part_id.flatten())
         return segmentation + _LENGTHS * off + turned + lengths + lines
 
