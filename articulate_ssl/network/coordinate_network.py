@@ -90,16 +90,17 @@ class CoordinateNetwork(SurfaceNetwork):
         K = self.num_parts
         pose = self.pose(whole).unflatten(-1, (K, 9))
         columns = pose[..., :6].unflatten(-1, (3, 2)) + torch.eye(3, 2, dtype=pose.dtype, device=pose.device)
-        center, axis, pivot = self.structure(whole).split([3 * K, 3 * K - 3, 3 * K - 3], dim=-1)
-        return WholeShape(
-            rotation=roma.special_gramschmidt(columns),
-            shift=pose[..., 6:],
-            center=center.unflatten(-1, (K, 3)),
-            axis=functional.normalize(axis.unflatten(-1, (K - 1, 3)), dim=-1),
-            pivot=pivot.unflatten(-1, (K - 1, 3)),
-            local=local,
-            whole=whole,
-        )
+        center, axis, pivot = self.structure_of(whole)
+        return WholeShape(roma.special_gramschmidt(columns), pose[..., 6:], center, axis, pivot, local, whole)
+
+    def structure_of(
+        self,
+        whole: Tensor,  # [B, D]
+    ) -> tuple[Tensor, Tensor, Tensor]:  # [B, K, 3], [B, J, 3], [B, J, 3]
+        """Part centres, axes and pivots as `WholeShape` has them, by features of whole clouds."""
+        said, last = self.structure(whole).unflatten(-1, (-1, 3)), self.num_parts - 1
+        center, axis, pivot = said.split([self.num_parts, last, last], dim=-2)
+        return center, functional.normalize(axis, dim=-1), pivot
 
     def coordinates(self, seen: SurfaceCloud, said: WholeShape) -> tuple[Tensor, Tensor]:  # [B, N, K], [B, K, N, 3]
         """Part logits of all points, and their coordinates in every part's space.
