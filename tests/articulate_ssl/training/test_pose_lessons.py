@@ -12,6 +12,7 @@ from articulate_ssl.baselines.perfect_oracle import perfect_oracle
 from articulate_ssl.geometry.se3 import se3
 from articulate_ssl.inference import pose_network
 from articulate_ssl.inference.pose_network import PoseNetwork
+from articulate_ssl.network.coordinate_network import CoordinateNetwork
 from articulate_ssl.network.surface_network import SurfaceSize
 from articulate_ssl.training import pose_lessons
 from articulate_ssl.training.pose_lessons import PoseLessons, learn_poses, teach
@@ -98,3 +99,16 @@ def test_few_clouds_teach_nothing(labels):
     module = _Module(labels)
     learn_poses(module, labels["dense_points"])
     assert not module.estimator.pose_network.learnt
+
+
+def test_axes_teach_no_features(labels):
+    """But the layer that says them: with other axes its gradient differs, and no other's does."""
+    network, lessons = CoordinateNetwork(2, TINY), PoseLessons.of(labels["dense_points"], _fits(labels))
+    frame, gradients = lessons.pose[:, lessons.root, :3, :3].float(), []
+    for one in (lessons, replace(lessons, axis=lessons.axis.roll(1, dims=-1))):
+        drawn = replace(one, points=one.points[:, : TINY.read].float(), part_id=one.part_id[:, : TINY.read])
+        network.zero_grad()
+        drawn.loss(network, frame).backward()
+        gradients.append({name: value.grad.clone() for name, value in network.named_parameters()})
+    differ = {name for name, value in gradients[0].items() if not torch.equal(value, gradients[1][name])}
+    assert differ == {"structure.weight", "structure.bias"}
