@@ -131,7 +131,7 @@ class PoseLessons:
         off = (coordinates.gather(1, own) - every.gather(1, own)).norm(dim=-1).mean()
         turned = (said.rotation - frame[:, None].mT @ self.pose[..., :3, :3]).square().sum((-1, -2)).mean()
         lengths = (said.center - self.center).norm(dim=-1).mean() + (said.pivot - self.pivot).norm(dim=-1).mean()
-        # It teaches no features. An oven in ten is hinged at a side; where they were to say of which, poses were 2.5 and
+        # It teaches no features. An oven in ten is hinged at a side; where features were to say which, poses were 2.5 and
         # not 1.7 degrees off, and axes 2.4 and not 2.2 (docs/experiments.md, step 214).
         axis = network.structure_of(said.whole.detach())[1]
         lines = (axis - self.axis).square().sum(-1).mean()
