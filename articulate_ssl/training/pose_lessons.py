@@ -131,8 +131,8 @@ class PoseLessons:
         off = (coordinates.gather(1, own) - every.gather(1, own)).norm(dim=-1).mean()
         turned = (said.rotation - frame[:, None].mT @ self.pose[..., :3, :3]).square().sum((-1, -2)).mean()
         lengths = (said.center - self.center).norm(dim=-1).mean() + (said.pivot - self.pivot).norm(dim=-1).mean()
-        # It teaches no features. An oven in ten is hinged at a side; where features were to say which, poses were 2.5 and
-        # not 1.7 degrees off, and axes 2.4 and not 2.2 (docs/experiments.md, step 214).
+        # It teaches no features: an oven in ten is hinged at a side, and where they were to say which, poses were 2.5
+        # and not 1.7 degrees off, and axes 2.4 and not 2.2 (docs/experiments.md, step 214).
         axis = network.structure_of(said.whole.detach())[1]
         lines = (axis - self.axis).square().sum(-1).mean()
         segmentation = functional.cross_entropy(logits.flatten(0, 1), self.part_id.flatten())
