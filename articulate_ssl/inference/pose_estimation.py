@@ -1,8 +1,7 @@
 """From clouds to articulated poses: aligned, hypothesised over the group, iterated, chosen, and registered.
 
-1. *Alignment* (stage 0): the rigid network turns the whole cloud to roughly canonical orientation.
-2. *Iteration*: the articulated network gives a hypothesis per group element; from the second pass on it reads the
-   cloud in the part frames of the last winner (paper, Sec. 3.1).
+1. *Alignment* (stage 0), and
+2. *iteration*, to a hypothesis per group element: `proposals`.
 3. *Registration* at test time: the leading hypotheses' predicted shapes are registered to the cloud without leaving
    their joints, and the best reconstruction wins. What is decided for in the end takes the cloud's own proportions
    (`proportions`), turned as its parts' faces say (`part_frames`), with the shape that clouds of the collection have
@@ -27,19 +26,17 @@ Training takes the first two steps too; nothing here knows a loss or an optimise
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from articulate_ssl.discovery.registration import chamfer_l1
-from articulate_ssl.geometry.kinematic_chain import KinematicChain
-from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
+from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.inference.candidates import (
     ANOTHER_WAY,
     Candidates,
-    Iteration,
     angle_to,
     better,
     rivals,
@@ -57,19 +54,17 @@ from articulate_ssl.inference.packaging import as_prediction
 from articulate_ssl.inference.part_frames import PartFrames
 from articulate_ssl.inference.pose_network import PoseNetwork
 from articulate_ssl.inference.prediction import Prediction
+from articulate_ssl.inference.proposals import Proposals
 from articulate_ssl.inference.relief import NUM_FEATURES
 from articulate_ssl.inference.sliding_search import SlidingSearch
 from articulate_ssl.inference.state_range import StateRange
 from articulate_ssl.inference.two_ways import TwoWays
 from articulate_ssl.inference.view_search import ViewSearch
 from articulate_ssl.inference.votes import Votes
-from articulate_ssl.losses.reconstruction import distances_to_parts
 from articulate_ssl.network.articulated_network import ArticulatedNetwork
 from articulate_ssl.network.heads.shape import CanonicalShape
 from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.network.rigid_alignment import RigidAlignment
-from articulate_ssl.ops.chamfer import hypothesis_distances
-from articulate_ssl.ops.replay import Replay
 from articulate_ssl.shape.observation import Observation
 
 # Of the width of a joint's range: registration, before proportions, leaves doors 10 degrees off and more. Chosen.
@@ -77,7 +72,7 @@ _WELL_BEYOND = 0.15
 _RARE = 1.1  # by which errors of what is hinged elsewhere than most count more (docs/experiments.md, step 153). Chosen.
 
 
-class PoseEstimator:
+class PoseEstimator(Proposals):
     """Pose estimation with the networks of a module, which owns them, trains them and saves them.
 
     Args:
@@ -89,7 +84,6 @@ class PoseEstimator:
         inference: Registration at test time.
 
     Attributes:
-        agreement, compared: See `Iteration`; recipes may set them.
         two_ways: The decision between explanations that fit alike, if one was learnt; a module owns it.
         sliding: The search for parts that slide, if one was learnt; a module owns it.
         view_search: The search among simulated views, if there were any; a module owns it.
@@ -103,9 +97,6 @@ class PoseEstimator:
         pose_network: Which poses fits would say, if that was taught; a module owns it.
     """
 
-    agreement: float = 0.0
-    compared: int | None = None
-
     def __init__(
         self,
         articulated: ArticulatedNetwork,
@@ -115,7 +106,6 @@ class PoseEstimator:
         posterior_scale: float,
         inference: InferenceOptions,
     ) -> None:
-        self.articulated, self.rigid, self.iterations = articulated, rigid, iterations
         self.posterior_scale, self.inference = posterior_scale, inference
         self.two_ways = TwoWays(articulated.num_parts, articulated.num_parts * NUM_FEATURES)
         self.sliding = SlidingSearch(*articulated.category.template.shape[:2])
@@ -128,8 +118,7 @@ class PoseEstimator:
         self.object_frame = ObjectFrame()
         self.front_ends = FrontEnds(articulated.num_parts - 1)
         self.pose_network = PoseNetwork(articulated.num_parts)
-        self.observation = replace(observation, camera=self.hinge_sides.camera)
-        self._replay = Replay(self._weights, _copied)
+        super().__init__(articulated, rigid, iterations, replace(observation, camera=self.hinge_sides.camera))
         self.registration = HypothesisRegistration(inference, self.observation, self.states)
         self.decision = Decision(articulated, self.registration, self.two_ways)
         self.final = FinalFit(
@@ -148,40 +137,6 @@ class PoseEstimator:
         decides = self.two_ways.learnt or self.two_ways.surface is not None or self.hinge_sides.learnt
         measures = self.part_frames.learnt or self.object_frame.learnt or self.pose_network.learnt
         return bool(decides or measures)
-
-    def align(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Stage 0: clouds turned roughly to canonical orientation [B, N, 3], and the pose [B, 4, 4] that undoes it."""
-        if self.rigid is None:
-            return points, torch.eye(4, dtype=points.dtype, device=points.device).expand(len(points), 4, 4)
-        with torch.no_grad():
-            hypotheses = self.rigid(points)
-            distance = hypothesis_distances(points, hypotheses.posed(), bidirectional=self.observation.bidirectional)
-            best = distance.argmin(dim=1)
-            rows = torch.arange(len(points), device=points.device)
-            pose = se3(hypotheses.rotation[rows, best], hypotheses.translation[rows, best])
-        return transform_points(invert_se3(pose), points), pose
-
-    def iterate(
-        self,
-        points: Tensor,  # [B, N, 3] aligned
-        chain: KinematicChain | None = None,
-        observation: Observation | None = None,
-    ) -> Iterator[Iteration]:
-        """Pose estimations, each from the winner of the one before.
-
-        Args:
-            chain: The category's, if it was asked for already.
-            observation: `Observation.known`, if it was.
-        """
-        start, labels = None, None
-        chain, observation = chain or self.articulated.category.chain(), observation or self.observation
-        for number in range(self.iterations):
-            hypotheses = self.articulated(points, start, labels, chain)
-            iteration = Iteration(points, hypotheses, start, observation, self.agreement, self.compared)
-            yield iteration
-            if number + 1 < self.iterations:
-                start = hypotheses.select(iteration.winner)
-                labels = distances_to_parts(points, start.posed()[:, 0]).argmin(dim=-1)
 
     @torch.no_grad()
     def predict(
@@ -389,33 +344,9 @@ class PoseEstimator:
             turn = None if turn is None else pose[:, :3, :3].mT @ turn
             candidates, error = self.registration.leading(last, transform_points(invert_se3(pose), points), turn)
         else:
-            candidates, error, pose = self._proposed(points[:, :num_points])
+            candidates, error, pose = self.proposed(points[:, :num_points])
         candidates = candidates.at(pose[:, None] @ candidates.base, candidates.state)
         return Candidates(error, candidates.base, candidates.state, candidates.select)
-
-    def _proposed(
-        self,
-        points: Tensor,  # [B, N, 3]
-    ) -> tuple[Hypotheses, Tensor, Tensor]:  # [B, H], [B, 4, 4]
-        """What the networks say: hypotheses in the aligned frame, their errors, and the pose of that frame."""
-        chain, observation = self.articulated.category.chain(), self.observation.known()
-
-        def proposed(clouds: Tensor) -> tuple[Hypotheses, Tensor, Tensor]:
-            aligned, pose = self.align(clouds)
-            *_, last = self.iterate(aligned, chain, observation)
-            return last.hypotheses, last.distance, pose
-
-        if observation.camera is not None:  # which way is up is read on the host
-            return proposed(points)
-        network = self.articulated
-        how = self.agreement, self.compared, network.shape_head.freedom, network.mixed_precision, network.training
-        return self._replay(proposed, points, (chain, *how))
-
-    def _weights(self) -> Iterator[Tensor]:
-        """All tensors that the networks read."""
-        for network in filter(None, (self.articulated, self.rigid)):
-            yield from network.parameters()
-            yield from network.buffers()
 
     def _slid(
         self,
@@ -539,10 +470,3 @@ class PoseEstimator:
         neighbours = self.inference.part_neighbours or 1
         distance = self.final.distance(chosen, points)
         return as_prediction(chosen, points, distance, margin, self.posterior_scale, neighbours, votes, dense)
-
-
-def _copied(proposed: tuple[Hypotheses, Tensor, Tensor]) -> tuple[Hypotheses, Tensor, Tensor]:
-    """See `PoseEstimator._proposed`."""
-    hypotheses, error, pose = proposed
-    every = torch.arange(len(error), device=error.device)
-    return hypotheses.rows(every), error.clone(), pose.clone()
