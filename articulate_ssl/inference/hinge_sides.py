@@ -11,14 +11,17 @@ quarter turns, and of the points only those that lie behind the closed door's pl
 
 Some bodies themselves seem to tell where the hinge is, as the opening of a safe leaves room for it at one side
 (docs/experiments.md, step 170). But of a safe the lock is above the handle. Where a door is hinged on the other side,
-objects are explained upside down; and who sees every object in the mirror as often as it is does not know at which side
-its hinge is. So there, all of a cloud is seen, as it is and in the mirror, and half turns are told.
+objects are explained upside down; and who sees every door in the mirror as often as it is does not know at which side
+its hinge is. So there doors are seen, each in its own frame, as they are and in the mirror, and half turns are told.
+Alone a door is seen from near: as many points of a whole safe show a seventh of the detail, by which a third of the
+wrong ones were found, and not more than four in five (step 217).
 
 A camera that is held upright knows which way is up (`upright_camera`); in its views no network is asked.
 """
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -35,7 +38,7 @@ from articulate_ssl.geometry.screw import REVOLUTE, screw_motion
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.inference.part_frames import PartFrames
 from articulate_ssl.inference.prediction import Prediction
-from articulate_ssl.inference.surface_decision import LOOKS, SIZE, WithSurface
+from articulate_ssl.inference.surface_decision import LOOKS, WithSurface
 from articulate_ssl.inference.upright_camera import UprightCamera
 from articulate_ssl.network.surface_network import SurfaceCloud, SurfaceSize
 from articulate_ssl.ops.spin_images import SPIN_CHANNELS, spin_images
@@ -45,39 +48,46 @@ from articulate_ssl.shape.object_axes import object_axes
 TURNS = 4  # quarter turns: sides that a door may be hinged at
 # What reads bodies; more points were not tried to the end (docs/experiments.md, step 133).
 BODY_SIZE = SurfaceSize(read=256, centers=128)
+DOOR_SIZE = SurfaceSize(read=384, centers=192)
+_FEWEST_POINTS = 256  # of a door, with which it is looked at. Chosen.
 # Behind the closed door's plane, in normalised units. With .04 fewer are found (docs/experiments.md, step 124).
 _BEHIND = 0.12
 _CLOSED_REACH = math.radians(120)  # from the middle of the joint's range: the closed door is not farther. Chosen.
 
+log = logging.getLogger(__name__)
+
 
 class Bodies(NamedTuple):
-    """What is seen of B bodies, in V versions of their clouds, without their doors; or of all of the clouds.
+    """What is seen of B bodies without their doors, in V versions of their clouds; or of their doors alone.
 
     Attributes:
         points: [V, B, S, 3] camera space; S is what the network reads in all its looks.
         surface: [V, B, S, SPIN_CHANNELS + 3] spin images and normals, in float16.
-        frames: [B, TURNS, 3, 3] frame -> camera: of the box as it is predicted, hinge first and door's normal last, and
-            the same turned about the latter by one, two and three quarters.
-        known: [B] whether enough of the body is seen.
+        frames: [B, TURNS, 3, 3] frame -> camera: of the box, or the door, as it is predicted, hinge first and door's
+            normal last, and the same turned about the latter by one, two and three quarters.
+        normal: [B, 3] of the closed door, camera space, about which objects are turned.
+        known: [B] whether enough is seen of it.
     """
 
     points: Tensor
     surface: Tensor
     frames: Tensor
+    normal: Tensor
     known: Tensor
 
 
 class HingeSides(WithSurface):
     """At which side objects are hinged, in quarter turns about the door's normal from where most are.
 
-    Of W ways there are `TURNS`, or as it is and upside down where all is seen.
+    Of W ways there are `TURNS`, or as it is and upside down where doors are seen.
 
     Attributes:
-        whole: [] whether all of a cloud is seen, and in the mirror.
+        doors: [] whether doors are seen, also in the mirror, and not bodies.
         learnt: [] whether some objects are hinged elsewhere. Then joint states count from `closed`.
         closed: [] joint state at which the door is closed, of predictions before; 0 once half turns alone are told, as
             mirror images are closed by as much.
         axes: [3, 3] columns: of the object's box in canonical space, the door's normal last, pointing at the body.
+        shut: [] joint state at which the door is closed, where states do not count from that.
         door: [3] canonical space, the middle of the closed door.
         log_prior: [TURNS] logarithm of the share of objects that are to be turned so; as many as there are ways count.
         surface: How right a body looks.
@@ -88,23 +98,31 @@ class HingeSides(WithSurface):
         super().__init__()
         self.camera = UprightCamera()
         self.register_buffer("learnt", torch.tensor(False))
-        self.register_buffer("whole", torch.tensor(False))
+        self.register_buffer("doors", torch.tensor(False))
         self.register_buffer("closed", torch.tensor(0.0))
+        self.register_buffer("shut", torch.tensor(0.0))
         self.register_buffer("axes", torch.eye(3))
         self.register_buffer("door", torch.zeros(3))
         self.register_buffer("log_prior", torch.zeros(TURNS))
+
+    def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
+        if state_dict.pop(f"{prefix}whole", False):
+            log.warning("what whole clouds taught of which side is up, until 2026-11-26, is left out: teach it again")
+            for name in [name for name in state_dict if name.startswith(prefix)]:
+                del state_dict[name]
+        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     @property
     def size(self) -> SurfaceSize:
         """Of the network that was taught, or is to be."""
         if self.surface is not None:
             return self.surface.size
-        return SIZE if self.whole else BODY_SIZE
+        return DOOR_SIZE if self.doors else BODY_SIZE
 
     @property
     def quarters(self) -> Tensor:  # [W]
         """By how many quarters the ways are turned."""
-        return torch.arange(0, TURNS, 2 if self.whole else 1, device=self.closed.device)
+        return torch.arange(0, TURNS, 2 if self.doors else 1, device=self.closed.device)
 
     def measure(self, shape: ArticulatedShape, state_range: Tensor, frames: PartFrames | None = None) -> None:
         """Find axes and the closed door of a category's shape with one joint.
@@ -136,6 +154,7 @@ class HingeSides(WithSurface):
         normal = axes[:, 1 + int(extent[1:].argmin())]
         normal = normal * ((shape.part(root).mean(dim=0) - middle) @ normal).sign()
         self.closed.fill_(closed)
+        self.shut.fill_(closed)
         self.axes.copy_(torch.stack([hinge, torch.linalg.cross(normal, hinge), normal], dim=1))
         self.door.copy_(middle)
 
@@ -159,10 +178,9 @@ class HingeSides(WithSurface):
         prediction: Prediction,  # joint states count from the closed door
         dense: Tensor | None,  # [B, P, 3]
     ) -> tuple[Prediction, Tensor]:  # , [B]
-        """The same, its frame turned so that it stands, or the body looks right.
+        """The same, its frame turned so that it stands, or what is seen of it looks right.
 
-        Its margin is at most how sure it is that the body does. Where less is seen of a body than the network reads,
-        nothing is decided.
+        Its margin is at most how sure it is that it does. Where too little is seen of it, nothing is decided.
 
         Returns:
             That, and by how many quarters frames were turned.
@@ -179,13 +197,13 @@ class HingeSides(WithSurface):
         sure = (best[:, 0] - best[:, 1]) / (2 * self.surface.temperature)
         sure = torch.where(bodies.known, sure, torch.inf).tanh()
         quarters = torch.where(bodies.known, self.quarters[ways[:, 0]], 0)
-        turned = turned_about(prediction, bodies.frames[:, 0, :, 2], quarters)
+        turned = turned_about(prediction, bodies.normal, quarters)
         return replace(turned, margin=prediction.margin.minimum(sure)), quarters
 
     def looks_right(self, bodies: Bodies) -> Tensor:  # [B, W]
-        """How right bodies look, as they are, in each of their ways."""
+        """How right what is seen looks, as it is, in each of its ways."""
         frames, looks = bodies.frames[:, self.quarters], []
-        if self.whole:
+        if self.doors:
             mirror = torch.tensor([1.0, -1.0, 1.0]).to(frames)
             frames = torch.cat([frames, frames * mirror], dim=1)
         for first in range(LOOKS):
@@ -201,24 +219,36 @@ class HingeSides(WithSurface):
         dense: Tensor,  # [B, P, 3] farthest-point order
         versions: Sequence[Tensor],  # of [B, P, 3] the same points, as they are or with noise
     ) -> Bodies:
-        """What is seen of clouds' bodies."""
-        shown = LOOKS * self.size.read
+        """What is seen of clouds."""
+        box = self._boxes(prediction, dense)
+        normal = box[:, :, 2]
+        if self.doors:
+            first, own, fewest = *self._doors(prediction), _FEWEST_POINTS
+        else:
+            first, own, fewest = box, self._behind_the_door(prediction, dense, normal), LOOKS * self.size.read
+        quarter = torch.tensor([0.0, 0.0, math.pi / 2]).to(box) * torch.arange(TURNS).to(box)[:, None]
+        frames = first[:, None] @ roma.rotvec_to_rotmat(quarter)
+        known = own.sum(dim=1) >= fewest
+        own = own | ~known[:, None]  # of these nothing is decided
+        described = [_described(version, own, LOOKS * self.size.read) for version in versions]
+        points, surface = (torch.stack(some) for some in zip(*described, strict=True))
+        return Bodies(points, surface, frames, normal, known)
+
+    def _boxes(self, prediction: Prediction, dense: Tensor) -> Tensor:  # [B, 3, 3]
+        """Frames of the boxes as they are predicted, each turned to the nearest of the cloud's own axes."""
         axes = manhattan_frames(dense, torch.Generator().manual_seed(0))[0].mT
         every = axes[:, None] @ rotation_group(24).elements.to(axes)  # the same axes in every order
         said = prediction.base_pose[:, :3, :3] @ self.axes.to(axes)
         nearest = (every * said[:, None]).sum(dim=(-2, -1)).argmax(dim=1)
-        box = every[torch.arange(len(every), device=every.device), nearest]
-        quarter = torch.tensor([0.0, 0.0, math.pi / 2]).to(box) * torch.arange(TURNS).to(box)[:, None]
-        frames = box[:, None] @ roma.rotvec_to_rotmat(quarter)
+        return every[torch.arange(len(every), device=every.device), nearest]
 
-        own = torch.ones_like(dense[..., 0], dtype=torch.bool)
-        if not self.whole:
-            own = self._behind_the_door(prediction, dense, box[:, :, 2])
-        known = own.sum(dim=1) >= shown
-        own |= ~known[:, None]  # of these nothing is decided
-        described = [_described(version, own, shown) for version in versions]
-        points, surface = (torch.stack(some) for some in zip(*described, strict=True))
-        return Bodies(points, surface, frames, known)
+    def _doors(self, prediction: Prediction) -> tuple[Tensor, Tensor]:  # [B, 3, 3], [B, P] bool
+        """Frames of the doors, those of the boxes when they are closed; and which points are theirs."""
+        child = int(prediction.joint_child[0, 0])
+        shut = self.shut.to(prediction.joint_state)
+        motion = screw_motion(prediction.canonical_axis, prediction.canonical_pivot, shut, REVOLUTE)[:, 0]
+        turn = prediction.part_pose[:, child, :3, :3] @ motion[:, :3, :3].mT
+        return turn @ self.axes.to(turn), prediction.dense_part_id == child
 
     def _behind_the_door(
         self,
@@ -262,15 +292,16 @@ def turned_about(
 
 def _described(
     clouds: Tensor,  # [B, P, 3]
-    own: Tensor,  # [B, P] bool, at least so many of each as are shown
+    own: Tensor,  # [B, P] bool, some of each
     shown: int,
 ) -> tuple[Tensor, Tensor]:  # [B, S, 3], [B, S, SPIN_CHANNELS + 3]
-    """The leading points of the bodies, and their surface as it is without the doors."""
+    """The leading points of what is seen, from the first again where there are fewer, and their surface, alone."""
     points, surface = [], []
     for cloud, mine in zip(clouds, own, strict=True):
-        body = cloud[None, mine]
-        points.append(body[:, :shown])
-        surface.append(torch.cat(spin_images(points[-1], body), dim=-1).half())
+        seen = cloud[None, mine]
+        leading, again = seen[:, :shown], torch.arange(shown, device=seen.device) % seen.shape[1]
+        points.append(seen[:, again])
+        surface.append(torch.cat(spin_images(leading, seen), dim=-1).half()[:, again])
     return torch.cat(points), torch.cat(surface)
 
 

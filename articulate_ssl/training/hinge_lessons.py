@@ -3,9 +3,8 @@
 No label is read. A network is taught that objects stand right as they are predicted and wrong when they are turned, all
 of them, though of ovens one in nine lies on its side. What it disagrees with is turned, and it is taught anew, twice:
 it then stands more than nine in ten of the lying ovens up and turns over one in fifty others (docs/experiments.md,
-step 124). If all bodies seem to stand alike, it is taught anew by whole clouds and their mirror images, once, and each
-lesson is doubted: three without doubt teach no more (step 130). In views of an upright camera nothing of that is
-needed.
+step 124). If all bodies seem to stand alike, it is taught anew by doors and their mirror images, once, and each lesson
+is doubted: three without doubt taught no more (step 130). In views of an upright camera nothing of that is needed.
 """
 
 from __future__ import annotations
@@ -29,8 +28,8 @@ if TYPE_CHECKING:
 
 _BATCH, _CHUNK = 16, 64
 _ROUNDS = 3  # of lessons about bodies
-_DOUBT = 0.06  # share of the lessons about whole clouds that may be wrong. No other was tried.
-# Share of the first clouds in which enough of the body is seen, without which nothing is learnt. Chosen.
+_DOUBT = 0.06  # share of the lessons about doors that may be wrong. No other was tried.
+# Share of the first clouds in which enough is seen of the body, or the door, without which nothing is learnt. Chosen.
 _FIRST, _KNOWN = 64, 0.9
 _VIEWS = 256  # of an upright camera, from which nothing is learnt but a direction and a share. Chosen.
 # Shares of the clouds that the network was not taught by. Chosen: fewer that are turned are not worth a network; more
@@ -51,7 +50,7 @@ def learn_hinge_sides(
     estimator, network = module.estimator, module.articulated
     sides = estimator.hinge_sides
     sides.learnt.fill_(False)  # of a run that ended and goes on
-    sides.whole.fill_(False)
+    sides.doors.fill_(False)
     sides.camera.forget()
     sides.surface = None
     if network.num_parts != 2 or network.joint_type != REVOLUTE or TAUGHT * len(clouds) < FEWEST:
@@ -64,21 +63,26 @@ def learn_hinge_sides(
         _learn_upright(module, clouds[:_VIEWS])
         return
     predictions = _predictions(module, clouds[:_FIRST])
-    if _bodies(module, clouds[:_FIRST], predictions).known.double().mean() < _KNOWN:
+    if not _seen_enough(_bodies(module, clouds[:_FIRST], predictions)):
         tell(log, "hinge sides: too little is seen behind the closed door")
         return
     predictions += _predictions(module, clouds[_FIRST:])
-    for whole in (False, True):
+    for doors in (False, True):
         sides.surface = None
-        sides.whole.fill_(whole)
-        if not _learnt(module, _bodies(module, clouds, predictions)):
+        sides.doors.fill_(doors)
+        bodies = _bodies(module, clouds, predictions)
+        if not _seen_enough(bodies) or not _learnt(module, bodies):
             continue
-        if whole:
+        if doors:
             sides.closed.zero_()  # what is upside down is a mirror image, whose door is as far from closed
         sides.learnt.fill_(True)
         return
-    sides.whole.fill_(False)
+    sides.doors.fill_(False)
     sides.surface = None
+
+
+def _seen_enough(bodies: Bodies) -> bool:
+    return float(bodies.known.double().mean()) >= _KNOWN
 
 
 def _learn_upright(module: ArticulatedPoseModule, views: Tensor) -> None:
@@ -104,10 +108,10 @@ def _learnt(module: ArticulatedPoseModule, bodies: Bodies) -> bool:
     taught, rest = _rows(bodies, order[:count]), _rows(bodies, order[count:])
     every, ways = torch.arange(count, device=order.device)[:, None], torch.arange(len(sides.quarters)).to(order)
     turned = torch.zeros_like(every)
-    seen, rounds, doubt = ("whole clouds", 1, _DOUBT) if sides.whole else ("bodies", _ROUNDS, 0.0)
+    seen, rounds, doubt = ("doors", 1, _DOUBT) if sides.doors else ("bodies", _ROUNDS, 0.0)
     for lesson in range(1, rounds + 1):
         frames = taught.frames[every, sides.quarters[(turned + ways) % len(ways)]]
-        lessons = Lessons(taught.points, taught.surface, frames, bool(sides.whole), doubt)
+        lessons = Lessons(taught.points, taught.surface, frames, bool(sides.doors), doubt)
         sides.surface = teach(lessons, f"which side is up, {lesson} of {rounds}", sides.size)
         if lesson < rounds:
             turned = _odds(module, taught).argmax(dim=1, keepdim=True)
@@ -141,13 +145,13 @@ def _bodies(module: ArticulatedPoseModule, clouds: Tensor, predictions: Sequence
         announced(log, "hinge sides, surfaces", clouds.split(_BATCH)), predictions, strict=True
     ):
         found.append(sides.bodies(prediction, some, (some, with_noise(some, generator))))
-    points, surface, frames, known = zip(*found, strict=True)
-    return Bodies(torch.cat(points, dim=1), torch.cat(surface, dim=1), torch.cat(frames), torch.cat(known))
+    points, surface, *rest = zip(*found, strict=True)
+    return Bodies(torch.cat(points, dim=1), torch.cat(surface, dim=1), *(torch.cat(one) for one in rest))
 
 
 def _rows(bodies: Bodies, rows: Tensor) -> Bodies:
     """Some of them."""
-    return Bodies(bodies.points[:, rows], bodies.surface[:, rows], bodies.frames[rows], bodies.known[rows])
+    return Bodies(bodies.points[:, rows], bodies.surface[:, rows], *(one[rows] for one in bodies[2:]))
 
 
 def _odds(module: ArticulatedPoseModule, bodies: Bodies) -> Tensor:

@@ -11,8 +11,8 @@ from tiny import POINTS, tiny_module
 
 from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.geometry.screw import REVOLUTE, screw_motion
-from articulate_ssl.geometry.se3 import se3, transform_points
-from articulate_ssl.inference.hinge_sides import BODY_SIZE, TURNS, Bodies, HingeSides, turned_about
+from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
+from articulate_ssl.inference.hinge_sides import BODY_SIZE, DOOR_SIZE, TURNS, Bodies, HingeSides, turned_about
 from articulate_ssl.inference.part_frames import PartFrames
 from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.inference.surface_decision import LOOKS, SIZE, SurfaceDecision
@@ -100,17 +100,21 @@ def _lying(
     quarters: list[int],  # by which the frame of each of B objects is to be turned
     opened: float = 1.2,
     up: int = 1,
+    knob: bool = False,  # at the upper end of the door, +x
 ) -> tuple[Prediction, torch.Tensor, torch.Tensor]:
     """Predictions by the one joint there is, dense clouds, and the true rotations canonical -> camera."""
     generator, shape = torch.Generator().manual_seed(3), _shape()
     count = len(quarters)
     body, door = _parts(generator, 3000, up)
+    if knob:
+        at = torch.tensor([0.2, 0.0, -0.28])
+        door = torch.cat([door, at + _on_box(torch.tensor([0.1, 0.1, 0.02]), 300, generator)])
     base = se3(roma.random_rotmat(count), torch.rand(count, 3, generator=generator))
     state = torch.full((count, 1), ZERO + opened)
     sides = _sides()
     turn = roma.rotvec_to_rotmat(torch.tensor(quarters)[:, None] * QUARTER * sides.axes[:, 2])
     motion = screw_motion(HINGE, PIVOT, torch.tensor(opened), REVOLUTE)
-    dense = torch.cat([body @ turn.mT, transform_points(motion, door).expand(count, -1, -1)], dim=1)
+    dense = torch.cat([body @ turn.mT, transform_points(motion, door @ turn.mT)], dim=1)
     dense = transform_points(base, dense[:, torch.randperm(dense.shape[1], generator=generator)])
     rest = shape.points.view(1, -1, 3)
     parts = [rest[:, shape.label == k][:, :200].expand(count, -1, -1) for k in range(2)]
@@ -212,28 +216,54 @@ def test_a_lying_object_stands_up():
     torch.testing.assert_close(kept.base_pose, prediction.base_pose)
 
 
-def test_upside_down_is_told_by_whole_clouds_too():
-    prediction, dense, true = _lying([0, 2, 2], up=0)
+def _labelled(prediction: Prediction, dense: torch.Tensor) -> Prediction:
+    """And which points are the door's: those before the box."""
+    own = transform_points(invert_se3(prediction.base_pose), dense)
+    return replace(prediction, dense_part_id=(own[..., 2] < -0.2501).long())
+
+
+def test_upside_down_is_told_by_doors_too():
+    """However wide they are open."""
+    for opened in (0.3, 1.2):
+        prediction, dense, true = _lying([0, 2, 2], opened, knob=True)
+        prediction = _labelled(prediction, dense)
+        sides = _sides()
+        sides.doors.fill_(True)
+        sides.closed.zero_()
+        sides.surface = _TopIsUp(up=0, size=DOOR_SIZE)
+        decided, _ = sides.decided(sides.counted_from_closed(prediction), dense)
+        _same_in_camera_space(decided, prediction)
+        off = roma.rotmat_geodesic_distance(decided.base_pose[:, :3, :3], true).rad2deg()
+        assert off.max() < 2
+        bodies = sides.bodies(prediction, dense, (dense, dense + 0.001))
+        assert bodies.known.all() and bodies.points.shape == (2, 3, LOOKS * DOOR_SIZE.read, 3)
+        turn = prediction.part_pose[:, 1, :3, :3] @ screw_motion(HINGE, PIVOT, torch.tensor(ZERO), REVOLUTE)[:3, :3].mT
+        torch.testing.assert_close(bodies.frames[:, 0], turn @ sides.axes)  # the door's, and not the box's
+        torch.testing.assert_close(bodies.normal, prediction.base_pose[:, :3, 2], atol=1e-2, rtol=0)
+        flat = torch.einsum("bni,bi->bn", bodies.points[0] - bodies.points[0].mean(1, keepdim=True), turn[..., 2])
+        assert flat.abs().max() < 0.1  # and nothing but the door
+
+
+def test_a_door_of_few_points_is_looked_at_again_and_of_fewer_not_at_all():
+    prediction, dense, _ = _lying([0, 0])
     sides = _sides()
-    sides.whole.fill_(True)
-    sides.surface = _TopIsUp(up=0, size=SIZE)
-    decided, _ = sides.decided(sides.counted_from_closed(prediction), dense)
-    _same_in_camera_space(decided, prediction)
-    off = roma.rotmat_geodesic_distance(decided.base_pose[:, :3, :3], true).rad2deg()
-    assert off.max() < 2
-    bodies = sides.bodies(prediction, dense, (dense,))
-    assert bodies.known.all()
-    torch.testing.assert_close(bodies.points[0], dense[:, : LOOKS * SIZE.read])  # doors, too
+    sides.doors.fill_(True)
+    label = torch.zeros(dense.shape[:2], dtype=torch.long)
+    label[0, :300], label[1, :200] = 1, 1
+    bodies = sides.bodies(replace(prediction, dense_part_id=label), dense, (dense,))
+    assert bodies.known.tolist() == [True, False]
+    assert torch.equal(bodies.points[0, 0, 300:600], dense[0, :300])
+    assert torch.equal(bodies.surface[0, 0, 300:600], bodies.surface[0, 0, :300])
 
 
-def test_in_whole_clouds_it_does_not_show_at_which_side_a_hinge_is():
-    """What looks right is the same of a cloud and of its mirror image, whatever the network."""
+def test_of_doors_it_does_not_show_at_which_side_a_hinge_is():
+    """What looks right is the same of a door and of its mirror image, whatever the network."""
     torch.manual_seed(0)
     sides = _sides()
-    sides.whole.fill_(True)
+    sides.doors.fill_(True)
     sides.surface = SurfaceDecision(TINY).requires_grad_(False)
-    prediction, dense, _ = _lying([0, 2])
-    bodies = sides.bodies(prediction, dense, (dense,))
+    prediction, dense, _ = _lying([0, 2], knob=True)
+    bodies = sides.bodies(_labelled(prediction, dense), dense, (dense,))
     mirror = torch.diag(torch.tensor([1.0, -1.0, 1.0]))
     across = bodies.frames[:, 0] @ mirror @ bodies.frames[:, 0].mT  # camera space
     points, surface = bodies.points @ across.mT, bodies.surface.clone()
@@ -244,7 +274,7 @@ def test_in_whole_clouds_it_does_not_show_at_which_side_a_hinge_is():
         sides.looks_right(bodies._replace(points=points, surface=surface)), looks, atol=1e-3, rtol=0
     )
     # Seen as it is only, it shows.
-    sides.whole.fill_(False)
+    sides.doors.fill_(False)
     alone = sides.looks_right(bodies._replace(points=points, surface=surface)) - sides.looks_right(bodies)
     assert alone.abs().max() > 1e-2
 
@@ -304,7 +334,9 @@ def _drawn(quarters: torch.Tensor, up: int = 1) -> Bodies:
     points = (body @ turn.mT)[None]
     steps = roma.rotvec_to_rotmat(torch.arange(TURNS)[:, None] * torch.tensor([0.0, 0.0, QUARTER]))
     surface = torch.zeros(*points.shape[:-1], 37, dtype=torch.float16)
-    return Bodies(points, surface, (axes @ steps).expand(len(quarters), -1, -1, -1), torch.ones(len(quarters)) > 0)
+    count = len(quarters)
+    frames = (axes @ steps).expand(count, -1, -1, -1)
+    return Bodies(points, surface, frames, frames[:, 0, :, 2], torch.ones(count) > 0)
 
 
 @pytest.mark.parametrize(("share", "learnt"), [(0.12, True), (0.0, False), (0.6, False)], ids=["some", "none", "most"])
@@ -372,17 +404,17 @@ def test_lessons_turn_what_the_network_disagrees_with(box_module, monkeypatch):
 
 
 @pytest.mark.parametrize("hidden", [False, True], ids=["bodies tell", "bodies do not"])
-def test_whole_clouds_are_shown_where_all_bodies_seem_to_stand_alike(box_module, monkeypatch, hidden):
+def test_doors_are_shown_where_all_bodies_seem_to_stand_alike(box_module, monkeypatch, hidden):
     quarters = torch.where(torch.rand(200, generator=torch.Generator().manual_seed(2)) < 0.12, 2, 0)
     sides, given, up = box_module.hinge_sides, [], 0 if hidden else 1
 
     def seen(_, clouds, __):
-        return _drawn(quarters[: len(clouds)] * (0 if hidden and not sides.whole else 1), up)
+        return _drawn(quarters[: len(clouds)] * (0 if hidden and not sides.doors else 1), up)
 
     monkeypatch.setattr(hinge_lessons, "_bodies", seen)
     monkeypatch.setattr(hinge_lessons, "teach", lambda lessons, *_: given.append(lessons) or _TopIsUp(up))
     learn_hinge_sides(box_module, torch.zeros(200, POINTS, 3))
-    assert sides.learnt and bool(sides.whole) == hidden
+    assert sides.learnt and bool(sides.doors) == hidden
     assert [lessons.mirrored for lessons in given] == [False] * 3 + [True] * hidden
     assert [lessons.frames.shape[1] for lessons in given] == [4] * 3 + [2] * hidden
     assert [lessons.doubt > 0 for lessons in given] == [lessons.mirrored for lessons in given]
@@ -394,15 +426,28 @@ def test_it_is_part_of_the_weights_and_older_ones_have_none():
     module = tiny_module(num_parts=2)
     module.hinge_sides.surface = SurfaceDecision().requires_grad_(False)
     module.hinge_sides.learnt.fill_(True)
-    module.hinge_sides.whole.fill_(True)
+    module.hinge_sides.doors.fill_(True)
     module.hinge_sides.closed.fill_(0.7)
     other = tiny_module(num_parts=2)
     other.load_state_dict(module.state_dict())
-    assert other.hinge_sides.learnt and other.hinge_sides.whole and other.hinge_sides.surface is not None
+    assert other.hinge_sides.learnt and other.hinge_sides.doors and other.hinge_sides.surface is not None
     torch.testing.assert_close(other.state_range, other.states.limits - 0.7)
     older = {name: value for name, value in module.state_dict().items() if "hinge_sides" not in name}
     other.load_state_dict(older)
     assert other.hinge_sides.surface is None
+
+
+def test_what_whole_clouds_taught_is_left_out(caplog):
+    """As until 2026-11-26."""
+    module, other = tiny_module(num_parts=2), tiny_module(num_parts=2)
+    module.hinge_sides.surface = SurfaceDecision().requires_grad_(False)
+    module.hinge_sides.learnt.fill_(True)
+    older = {name: value for name, value in module.state_dict().items() if "hinge_sides.doors" not in name}
+    other.load_state_dict(older | {"hinge_sides.whole": torch.tensor(True)})
+    assert not other.hinge_sides.learnt and other.hinge_sides.surface is None
+    assert "teach it again" in caplog.text
+    other.load_state_dict(older | {"hinge_sides.whole": torch.tensor(False)})
+    assert other.hinge_sides.learnt and other.hinge_sides.surface is not None
 
 
 def test_predictions_count_from_the_closed_door_with_and_without_a_dense_cloud():
