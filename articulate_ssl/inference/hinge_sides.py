@@ -31,6 +31,7 @@ import roma
 import torch
 from scipy.spatial import ConvexHull
 from torch import Tensor
+from torch.nn import functional
 
 from articulate_ssl.discovery.manhattan_frame import manhattan_frames
 from articulate_ssl.geometry.rotation_group import rotation_group
@@ -50,6 +51,8 @@ TURNS = 4  # quarter turns: sides that a door may be hinged at
 BODY_SIZE = SurfaceSize(read=256, centers=128)
 DOOR_SIZE = SurfaceSize(read=384, centers=192)
 _FEWEST_POINTS = 256  # of a door, with which it is looked at. Chosen.
+_ROOM = 0.02  # before and behind a door, in normalised units. Chosen.
+_PLANES = 3  # times that a door's plane is found, and its points by that. Chosen.
 # Behind the closed door's plane, in normalised units. With .04 fewer are found (docs/experiments.md, step 124).
 _BEHIND = 0.12
 _CLOSED_REACH = math.radians(120)  # from the middle of the joint's range: the closed door is not farther. Chosen.
@@ -223,7 +226,7 @@ class HingeSides(WithSurface):
         box = self._boxes(prediction, dense)
         normal = box[:, :, 2]
         if self.doors:
-            first, own, fewest = *self._doors(prediction), _FEWEST_POINTS
+            first, own, fewest = *self._doors(prediction, dense, box[:, :, 0]), _FEWEST_POINTS
         else:
             first, own, fewest = box, self._behind_the_door(prediction, dense, normal), LOOKS * self.size.read
         quarter = torch.tensor([0.0, 0.0, math.pi / 2]).to(box) * torch.arange(TURNS).to(box)[:, None]
@@ -242,13 +245,34 @@ class HingeSides(WithSurface):
         nearest = (every * said[:, None]).sum(dim=(-2, -1)).argmax(dim=1)
         return every[torch.arange(len(every), device=every.device), nearest]
 
-    def _doors(self, prediction: Prediction) -> tuple[Tensor, Tensor]:  # [B, 3, 3], [B, P] bool
-        """Frames of the doors, those of the boxes when they are closed; and which points are theirs."""
-        child = int(prediction.joint_child[0, 0])
-        shut = self.shut.to(prediction.joint_state)
+    def _doors(
+        self,
+        prediction: Prediction,
+        dense: Tensor,  # [B, P, 3]
+        hinge: Tensor,  # [B, 3] direction, square to the box
+    ) -> tuple[Tensor, Tensor]:  # [B, 3, 3], [B, P] bool
+        """Frames of the doors, those of the boxes when they are closed; and which points are in a slab about them.
+
+        How a door is believed to stand must not show: neither by a lean of its pose, as its plane is found again in the
+        cloud, nor by which points are said to be its own, as the slab ends at the hinge and nowhere else.
+        """
+        child, shut = int(prediction.joint_child[0, 0]), self.shut.to(prediction.joint_state)
         motion = screw_motion(prediction.canonical_axis, prediction.canonical_pivot, shut, REVOLUTE)[:, 0]
-        turn = prediction.part_pose[:, child, :3, :3] @ motion[:, :3, :3].mT
-        return turn @ self.axes.to(turn), prediction.dense_part_id == child
+        turn, middle = prediction.part_pose[:, child, :3, :3], prediction.part_pose[:, child, None, :3, 3]
+        normal = turn @ motion[:, :3, :3].mT @ self.axes[:, 2].to(turn)
+        pivot = prediction.joint_pivot[:, :1]
+        across = torch.linalg.cross(normal, hinge)
+        out = (((middle - pivot) @ across[..., None]).squeeze(-1)).sign()  # the door's side of its hinge
+        height = (prediction.part_shape[:, child] @ turn.mT @ normal[..., None]).squeeze(-1)
+        reach = (height.amax(1, keepdim=True) - height.amin(1, keepdim=True)) / 2 + _ROOM
+        for _ in range(_PLANES):
+            inside = ((dense - middle) @ normal[..., None]).squeeze(-1).abs() < reach
+            inside &= ((dense - pivot) @ across[..., None]).squeeze(-1) * out > 0
+            middle, least = _plane(dense, inside)
+            normal = least * (least * normal).sum(-1, keepdim=True).sign()
+            hinge = functional.normalize(hinge - (hinge * normal).sum(-1, keepdim=True) * normal, dim=-1)
+            across = torch.linalg.cross(normal, hinge)
+        return torch.stack([hinge, across, normal], dim=-1), inside
 
     def _behind_the_door(
         self,
@@ -288,6 +312,17 @@ def turned_about(
         canonical_axis=prediction.canonical_axis @ turn.mT,
         canonical_pivot=transform_points(change, prediction.canonical_pivot),
     )
+
+
+def _plane(
+    dense: Tensor,  # [B, P, 3]
+    own: Tensor,  # [B, P] bool
+) -> tuple[Tensor, Tensor]:  # [B, 1, 3], [B, 3]
+    """The mean of points, and the direction in which they extend least."""
+    weight = own[..., None].to(dense) / own.sum(dim=1)[:, None, None].clamp_min(1)
+    middle = (dense * weight).sum(dim=1, keepdim=True)
+    away = dense - middle
+    return middle, torch.linalg.eigh((away * weight).mT @ away)[1][..., 0]
 
 
 def _described(
