@@ -11,7 +11,7 @@ from tiny import POINTS, tiny_module
 
 from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.geometry.screw import REVOLUTE, screw_motion
-from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
+from articulate_ssl.geometry.se3 import se3, transform_points
 from articulate_ssl.inference.hinge_sides import BODY_SIZE, DOOR_SIZE, TURNS, Bodies, HingeSides, turned_about
 from articulate_ssl.inference.part_frames import PartFrames
 from articulate_ssl.inference.prediction import Prediction
@@ -216,44 +216,59 @@ def test_a_lying_object_stands_up():
     torch.testing.assert_close(kept.base_pose, prediction.base_pose)
 
 
-def _labelled(prediction: Prediction, dense: torch.Tensor) -> Prediction:
-    """And which points are the door's: those before the box."""
-    own = transform_points(invert_se3(prediction.base_pose), dense)
-    return replace(prediction, dense_part_id=(own[..., 2] < -0.2501).long())
-
-
-def test_upside_down_is_told_by_doors_too():
-    """However wide they are open."""
-    for opened in (0.3, 1.2):
-        prediction, dense, true = _lying([0, 2, 2], opened, knob=True)
-        prediction = _labelled(prediction, dense)
-        sides = _sides()
-        sides.doors.fill_(True)
-        sides.closed.zero_()
-        sides.surface = _TopIsUp(up=0, size=DOOR_SIZE)
-        decided, _ = sides.decided(sides.counted_from_closed(prediction), dense)
-        _same_in_camera_space(decided, prediction)
-        off = roma.rotmat_geodesic_distance(decided.base_pose[:, :3, :3], true).rad2deg()
-        assert off.max() < 2
-        bodies = sides.bodies(prediction, dense, (dense, dense + 0.001))
-        assert bodies.known.all() and bodies.points.shape == (2, 3, LOOKS * DOOR_SIZE.read, 3)
-        turn = prediction.part_pose[:, 1, :3, :3] @ screw_motion(HINGE, PIVOT, torch.tensor(ZERO), REVOLUTE)[:3, :3].mT
-        torch.testing.assert_close(bodies.frames[:, 0], turn @ sides.axes)  # the door's, and not the box's
-        torch.testing.assert_close(bodies.normal, prediction.base_pose[:, :3, 2], atol=1e-2, rtol=0)
-        flat = torch.einsum("bni,bi->bn", bodies.points[0] - bodies.points[0].mean(1, keepdim=True), turn[..., 2])
-        assert flat.abs().max() < 0.1  # and nothing but the door
-
-
-def test_a_door_of_few_points_is_looked_at_again_and_of_fewer_not_at_all():
-    prediction, dense, _ = _lying([0, 0])
+@pytest.mark.parametrize("opened", [0.3, 1.2, 2.2])
+def test_upside_down_is_told_by_doors_too(opened):
+    prediction, dense, true = _lying([0, 2, 2], opened, knob=True)
     sides = _sides()
     sides.doors.fill_(True)
-    label = torch.zeros(dense.shape[:2], dtype=torch.long)
-    label[0, :300], label[1, :200] = 1, 1
-    bodies = sides.bodies(replace(prediction, dense_part_id=label), dense, (dense,))
-    assert bodies.known.tolist() == [True, False]
-    assert torch.equal(bodies.points[0, 0, 300:600], dense[0, :300])
-    assert torch.equal(bodies.surface[0, 0, 300:600], bodies.surface[0, 0, :300])
+    sides.closed.zero_()
+    sides.surface = _TopIsUp(up=0, size=DOOR_SIZE)
+    decided, _ = sides.decided(sides.counted_from_closed(prediction), dense)
+    _same_in_camera_space(decided, prediction)
+    off = roma.rotmat_geodesic_distance(decided.base_pose[:, :3, :3], true).rad2deg()
+    assert off.max() < 2
+
+
+@pytest.mark.parametrize("opened", [1.2, 2.2])
+def test_nothing_seen_of_a_door_says_how_its_prediction_leans(opened):
+    """Nor how open it is believed to be, nor how long."""
+    sides = _sides()
+    sides.doors.fill_(True)
+    prediction, dense, _ = _lying([0], opened, knob=True)
+    bodies = sides.bodies(prediction, dense, (dense, dense + 0.001))
+    assert bodies.known.all() and bodies.points.shape == (2, 1, LOOKS * DOOR_SIZE.read, 3)
+    door = prediction.part_pose[0, 1, :3, :3] @ screw_motion(HINGE, PIVOT, torch.tensor(ZERO), REVOLUTE)[:3, :3].mT
+    assert (door.mT @ bodies.frames[0, 0]).diagonal().amin() > 0.999  # as the door lies, and not the box
+    assert (bodies.normal[0] @ prediction.base_pose[0, :3, 2]) > 0.999  # what turns is the box
+    away = (bodies.points[0, 0] - prediction.joint_pivot[0, 0]) @ door
+    assert away[:, 2].abs().max() < 0.1 and away[:, 1].max() < 1e-3  # the door alone
+
+    for lean in torch.tensor([[0.0, 0.05, 0.0], [0.1, 0.0, 0.0], [0.0, 0.0, 0.05]]):
+        turn = se3(roma.rotvec_to_rotmat(lean), torch.zeros(3))
+        leaning = replace(prediction, base_pose=prediction.base_pose @ turn, part_pose=prediction.part_pose @ turn)
+        short = replace(leaning, part_shape=0.7 * leaning.part_shape)
+        for other in (leaning, short):
+            seen = sides.bodies(other, dense, (dense,))
+            torch.testing.assert_close(seen.frames, bodies.frames, atol=1e-2, rtol=0)
+            same = (seen.points[0, 0, :, None] == bodies.points[0, 0]).all(-1).any(-1)
+            assert same.double().mean() > 0.95
+
+
+@pytest.mark.parametrize(("count", "known"), [(300, True), (200, False)])
+def test_a_door_of_few_points_is_looked_at_again_and_of_fewer_not_at_all(count, known):
+    sides = _sides()
+    sides.doors.fill_(True)
+    prediction, dense, _ = _lying([0], 2.2)
+    own = sides._doors(prediction, dense, sides._boxes(prediction, dense)[:, :, 0])[1]
+    some = torch.cat([dense[own][:count], dense[~own]])[None]
+    bodies = sides.bodies(prediction, some, (some,))
+    assert bodies.known.item() == known
+    if known:
+        seen, surface = bodies.points[0, 0], bodies.surface[0, 0]
+        assert len(seen.unique(dim=0)) < 330
+        again = (seen == seen[0]).all(dim=-1).nonzero()[1, 0]
+        assert torch.equal(seen[again : 2 * again], seen[:again])
+        assert torch.equal(surface[again : 2 * again], surface[:again])
 
 
 def test_of_doors_it_does_not_show_at_which_side_a_hinge_is():
@@ -263,7 +278,7 @@ def test_of_doors_it_does_not_show_at_which_side_a_hinge_is():
     sides.doors.fill_(True)
     sides.surface = SurfaceDecision(TINY).requires_grad_(False)
     prediction, dense, _ = _lying([0, 2], knob=True)
-    bodies = sides.bodies(_labelled(prediction, dense), dense, (dense,))
+    bodies = sides.bodies(prediction, dense, (dense,))
     mirror = torch.diag(torch.tensor([1.0, -1.0, 1.0]))
     across = bodies.frames[:, 0] @ mirror @ bodies.frames[:, 0].mT  # camera space
     points, surface = bodies.points @ across.mT, bodies.surface.clone()
