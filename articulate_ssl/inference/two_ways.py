@@ -49,8 +49,8 @@ _RIDGE = 0.3  # of discriminant analysis, in units of a standardised feature's v
 _CAP = 3.0  # standard deviations, beyond which a feature counts as this far
 _COMPONENTS = (2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24)  # whitened principal directions, tried in turn
 _STARTS, _STEPS, _RATE = 64, 80, 0.15  # of the descent to least kurtosis
-# One search in three ended in a difference of laptops that is right for 85 %, by .015 above the least, which is right for
-# 93 % (docs/experiments.md, step 219).
+# One search in three ended in a difference of laptops that is right for 85 %, by .015 above the least one, which is
+# right for 93 % (docs/experiments.md, step 219).
 _SEARCHES = 8
 _ROUNDS = 50  # of discriminant analysis at most; a handful is taken
 
