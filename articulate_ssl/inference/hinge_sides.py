@@ -13,8 +13,8 @@ Some bodies themselves seem to tell where the hinge is, as the opening of a safe
 (docs/experiments.md, step 170). But of a safe the lock is above the handle. Where a door is hinged on the other side,
 objects are explained upside down; and who sees every door in the mirror as often as it is does not know at which side
 its hinge is. So there doors are seen, each in its own frame, as they are and in the mirror, and half turns are told.
-Alone a door is seen from near: as many points of a whole safe show a seventh of the detail, by which a third of the
-wrong ones were found, and not more than four in five (step 217).
+A door that is shown alone is seen from near: by it four in five of the wrong ones are found, by as many points of
+whole safes, of which a seventh are the door's, it was a third (step 217).
 
 A camera that is held upright knows which way is up (`upright_camera`); in its views no network is asked.
 """
@@ -93,7 +93,7 @@ class HingeSides(WithSurface):
         shut: [] joint state at which the door is closed, where states do not count from that.
         door: [3] canonical space, the middle of the closed door.
         log_prior: [TURNS] logarithm of the share of objects that are to be turned so; as many as there are ways count.
-        surface: How right a body looks.
+        surface: How right a body, or a door, looks.
         camera: Which way is up, for a camera that is held upright.
     """
 
