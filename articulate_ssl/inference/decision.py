@@ -1,13 +1,14 @@
-"""Which of two explanations of a cloud is right, where that was learnt: by relief, by a network, or by both.
+"""Which of two explanations of a cloud is right, where that was learnt: by relief, by networks, or by all of them.
 
 Where a category's clouds can be explained in two ways that fit alike, the winner has a twin (`two_ways`), and the
-relief of the surface decides (`relief`), with a network if one was taught (`surface_decision`). Where fits tell
-explanations apart, a network that they taught decides between the winner and its rival.
+relief of the surface decides (`relief`), with networks if they were taught (`surface_decision`, `swapped_parts`). Where
+fits tell explanations apart, a network that they taught decides between the winner and its rival.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,10 +16,30 @@ from torch import Tensor
 from articulate_ssl.inference.candidates import frames_of, likelier
 from articulate_ssl.inference.hypothesis_registration import HypothesisRegistration
 from articulate_ssl.inference.relief import relief_of
-from articulate_ssl.inference.surface_decision import SurfaceDecision
+from articulate_ssl.inference.swapped_parts import (
+    SIZE,
+    PartViews,
+    exchanged_parts,
+    log_odds_from_near,
+    views_of_parts,
+)
 from articulate_ssl.inference.two_ways import TwoWays
 from articulate_ssl.network.articulated_network import ArticulatedNetwork
 from articulate_ssl.network.hypotheses import Hypotheses
+
+
+class BothWays(NamedTuple):
+    """What tells the two explanations of clouds apart.
+
+    Attributes:
+        frames: [B, 2, 3, 3] of explanations and of their twins, object -> camera.
+        reliefs: [B, F] and [B, F] of both, in each version of the clouds.
+        views: Of parts that the twin has exchanged, in all versions; None where it exchanges none.
+    """
+
+    frames: Tensor
+    reliefs: list[tuple[Tensor, Tensor]]
+    views: PartViews | None
 
 
 class Decision:
@@ -41,18 +62,22 @@ class Decision:
         points: Tensor,  # [B, N, 3]
         dense: Tensor,  # [B, P, 3]
         registers: bool,
-        surface: SurfaceDecision | None = None,
+        networks: bool = True,
     ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
         """Of the two explanations of clouds the one that their relief favours, the other, and by how much.
 
         Args:
-            surface: Has a say, too.
+            networks: Those that were taught have a say, too.
         """
-        twin, temperature = self.twin(one, points, registers), 1.0
-        odds = self.two_ways.relief_odds(self.relief(one, dense), self.relief(twin, dense))
-        if surface is not None:
-            odds, temperature = odds + surface.log_odds(frames_of(one, twin), dense), surface.temperature
-        return likelier(odds, one, twin, temperature)
+        twin, two_ways = self.twin(one, points, registers), self.two_ways
+        odds = two_ways.relief_odds(self.relief(one, dense), self.relief(twin, dense))
+        if not networks:
+            return likelier(odds, one, twin, 1.0)
+        if two_ways.surface is not None:
+            odds = odds + two_ways.surface.log_odds(frames_of(one, twin), dense)
+        if two_ways.near is not None:
+            odds = odds + log_odds_from_near(two_ways.near, self._views(one, twin, (dense,)))
+        return likelier(odds, one, twin, two_ways.temperature)
 
     def by_surface(
         self,
@@ -94,15 +119,23 @@ class Decision:
         base, state, _ = self.registration.register(start, points)
         return one.at(base, state)
 
-    def reliefs(
+    def both_ways(
         self,
         one: Hypotheses,  # H = 1
         points: Tensor,  # [B, N, 3]
-        dense: Sequence[Tensor],  # of [B, P, 3] the same clouds with all their points
-    ) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:  # [B, 2, 3, 3], of [B, F], [B, F]
-        """The frames of explanations and of their twins (object -> camera); the relief of both, in each of `dense`."""
+        dense: Sequence[Tensor],  # of [B, P, 3] the same clouds with all their points, as they are and with noise
+    ) -> BothWays:
+        """What is seen of explanations and of their twins."""
         twin = self.twin(one, points, registers=True)
-        return frames_of(one, twin), [(self.relief(one, some), self.relief(twin, some)) for some in dense]
+        reliefs = [(self.relief(one, some), self.relief(twin, some)) for some in dense]
+        return BothWays(frames_of(one, twin), reliefs, self._views(one, twin, dense))
+
+    def _views(self, one: Hypotheses, twin: Hypotheses, dense: Sequence[Tensor]) -> PartViews | None:
+        near, slot = self.two_ways.near, self.two_ways.slot
+        exchanged = exchanged_parts(one.chain, one.structure.joint_type, slot.tolist())
+        if exchanged is None:
+            return None
+        return views_of_parts(one, twin, slot, exchanged, dense, SIZE.read if near is None else near.size.read)
 
     def relief(
         self,

@@ -39,10 +39,10 @@ from articulate_ssl.geometry.screw import REVOLUTE, screw_motion
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.inference.part_frames import PartFrames
 from articulate_ssl.inference.prediction import Prediction
-from articulate_ssl.inference.surface_decision import LOOKS, WithSurface
+from articulate_ssl.inference.surface_decision import LOOKS, WithSurface, surface_alone
 from articulate_ssl.inference.upright_camera import UprightCamera
 from articulate_ssl.network.surface_network import SurfaceCloud, SurfaceSize
-from articulate_ssl.ops.spin_images import SPIN_CHANNELS, spin_images
+from articulate_ssl.ops.spin_images import SPIN_CHANNELS
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.object_axes import object_axes
 
@@ -233,7 +233,7 @@ class HingeSides(WithSurface):
         frames = first[:, None] @ roma.rotvec_to_rotmat(quarter)
         known = own.sum(dim=1) >= fewest
         own = own | ~known[:, None]  # of these nothing is decided
-        described = [_described(version, own, LOOKS * self.size.read) for version in versions]
+        described = [surface_alone(version, own, LOOKS * self.size.read) for version in versions]
         points, surface = (torch.stack(some) for some in zip(*described, strict=True))
         return Bodies(points, surface, frames, normal, known)
 
@@ -323,21 +323,6 @@ def _plane(
     middle = (dense * weight).sum(dim=1, keepdim=True)
     away = dense - middle
     return middle, torch.linalg.eigh((away * weight).mT @ away)[1][..., 0]
-
-
-def _described(
-    clouds: Tensor,  # [B, P, 3]
-    own: Tensor,  # [B, P] bool, some of each
-    shown: int,
-) -> tuple[Tensor, Tensor]:  # [B, S, 3], [B, S, SPIN_CHANNELS + 3]
-    """The leading points of what is seen, from the first again where there are fewer, and their surface, alone."""
-    points, surface = [], []
-    for cloud, mine in zip(clouds, own, strict=True):
-        seen = cloud[None, mine]
-        leading, again = seen[:, :shown], torch.arange(shown, device=seen.device) % seen.shape[1]
-        points.append(seen[:, again])
-        surface.append(torch.cat(spin_images(leading, seen), dim=-1).half()[:, again])
-    return torch.cat(points), torch.cat(surface)
 
 
 def _box_axes(shape: ArticulatedShape, part: int) -> Tensor:

@@ -42,7 +42,7 @@ from articulate_ssl.inference.candidates import (
     rivals,
 )
 from articulate_ssl.inference.common_shape import CommonShape
-from articulate_ssl.inference.decision import Decision
+from articulate_ssl.inference.decision import BothWays, Decision
 from articulate_ssl.inference.final_fit import ABOUT_AS_WELL, FinalFit
 from articulate_ssl.inference.front_ends import FrontEnds
 from articulate_ssl.inference.handedness import Handedness, in_the_mirror
@@ -294,7 +294,7 @@ class PoseEstimator(Proposals):
         else:
             chosen, other, margin = self._best(self._candidates(points, num_points, registers))
         if dense is not None and self.two_ways.learnt:
-            chosen, other, margin = self.decision.by_relief(chosen, points, dense, registers, self.two_ways.surface)
+            chosen, other, margin = self.decision.by_relief(chosen, points, dense, registers)
         elif dense is not None and self.two_ways.surface is not None:
             chosen, other, margin = self.decision.by_surface(chosen, other, margin, points, dense, registers)
         return chosen, other, margin, votes
@@ -316,15 +316,15 @@ class PoseEstimator(Proposals):
         return candidates.select(best), candidates.select(rival), margin
 
     @torch.no_grad()
-    def reliefs(
+    def both_ways(
         self,
         points: Tensor,  # [B, N, 3] normalised, farthest-point order
         num_points: int,
         dense: Sequence[Tensor],  # of [B, P, 3] the same clouds with all their points
-    ) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:  # [B, 2, 3, 3], of [B, F], [B, F]
-        """From which `two_ways` learns to decide: see `Decision.reliefs`, of predictions."""
+    ) -> BothWays:
+        """From which `two_ways` learns to decide: see `Decision.both_ways`, of predictions."""
         chosen, _, _ = self._best(self._candidates(points, num_points, registers=True))
-        return self.decision.reliefs(chosen, points, dense)
+        return self.decision.both_ways(chosen, points, dense)
 
     def _candidates(
         self,
@@ -442,7 +442,7 @@ class PoseEstimator(Proposals):
                 return self._packaged(found, points, margin, votes, dense), self.final.distance(found, points)
             found, other, margin = self._best(self.final.search(points))
             if dense is not None and self.two_ways.learnt:
-                found, other, margin = self.decision.by_relief(found, points, dense, registers=True)
+                found, other, margin = self.decision.by_relief(found, points, dense, registers=True, networks=False)
             return self._fitted(found, other, margin, points, dense)
 
     def _fitted(

@@ -76,25 +76,46 @@ class SurfaceDecision(SurfaceNetwork):
         return torch.stack(found).mean(dim=0)
 
 
+def surface_alone(
+    clouds: Tensor,  # [B, P, 3]
+    own: Tensor,  # [B, P] bool, some of each
+    shown: int,
+) -> tuple[Tensor, Tensor]:  # [B, S, 3], [B, S, SPIN_CHANNELS + 3]
+    """The leading points of a piece, from the first again where there are fewer, and its surface without the rest."""
+    points, surface = [], []
+    for cloud, mine in zip(clouds, own, strict=True):
+        seen = cloud[None, mine]
+        leading, again = seen[:, :shown], torch.arange(shown, device=seen.device) % seen.shape[1]
+        points.append(seen[:, again])
+        surface.append(torch.cat(spin_images(leading, seen), dim=-1).half()[:, again])
+    return torch.cat(points), torch.cat(surface)
+
+
 class WithSurface(nn.Module):
     """What decides by a network if one was taught.
 
     Weights from before something was learnt lack it: buffers then stay as they are.
+
+    Attributes:
+        NETWORKS: Names of the networks that it may have.
     """
 
+    NETWORKS: tuple[str, ...] = ("surface",)
     surface: SurfaceDecision | None
 
     def __init__(self) -> None:
         super().__init__()
-        self.register_module("surface", None)
+        for name in self.NETWORKS:
+            self.register_module(name, None)
 
     def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
         like = next(buffer for buffer in self.buffers() if buffer.is_floating_point())
-        self.surface = None
-        if any(name.startswith(f"{prefix}surface.") for name in state_dict):
-            read = int(state_dict.setdefault(f"{prefix}surface.read", torch.tensor(_ONCE_READ)))
-            size = replace(SIZE, read=read, centers=read // 2)
-            self.surface = SurfaceDecision(size).to(like).requires_grad_(False)
+        for network in self.NETWORKS:
+            setattr(self, network, None)
+            if any(name.startswith(f"{prefix}{network}.") for name in state_dict):
+                read = int(state_dict.setdefault(f"{prefix}{network}.read", torch.tensor(_ONCE_READ)))
+                size = replace(SIZE, read=read, centers=read // 2)
+                setattr(self, network, SurfaceDecision(size).to(like).requires_grad_(False))
         for name, value in self.named_buffers(recurse=False):
             state_dict.setdefault(prefix + name, value.clone())
         super()._load_from_state_dict(state_dict, prefix, *rest)

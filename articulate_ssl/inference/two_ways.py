@@ -11,8 +11,9 @@ for all clouds. So from the relief of both explanations of many clouds (`relief`
    its own answers until these stay. Of several starts the one that parts the clusters best wins. Last, discriminant
    analysis of the same answers on the clouds as they are and with noise on their points, which hides what is fine: what
    a scanner leaves of it must weigh no more than it is worth;
-3. the *surface*: a network that sees where relief is, taught by what the second step is sure of (`surface_decision`).
-   Its odds and those of relief are multiplied, as those of two witnesses.
+3. the *surface*: a network that sees where relief is, taught by what the second step is sure of (`surface_decision`);
+   and where the twin has two hinged parts exchanged another, taught alike, that sees each of them from near
+   (`swapped_parts`). Their odds and those of relief are multiplied, as those of several witnesses.
 
 Where fits tell the explanations apart there is no twin; there the network is taught by fits, and decides between what
 fits best and its rival.
@@ -32,7 +33,7 @@ import torch
 from torch import Tensor
 
 from articulate_ssl.geometry.se3 import invert_se3, se3
-from articulate_ssl.inference.surface_decision import WithSurface
+from articulate_ssl.inference.surface_decision import SurfaceDecision, WithSurface
 from articulate_ssl.ops.progress import tell
 
 _ALIKE = np.radians(25)  # rotations closer than this are the same twin
@@ -67,7 +68,11 @@ class TwoWays(WithSurface):
         scale: [F] standard deviation of the features' differences.
         weight: [F] of the standardised differences, in the logarithm of the odds.
         surface: The network, if there is one; without `learnt` it decides between predictions and their rivals.
+        near: The one that sees exchanged parts from near, if there is one.
     """
+
+    NETWORKS = ("surface", "near")
+    near: SurfaceDecision | None
 
     def __init__(self, num_parts: int, num_features: int) -> None:
         super().__init__()
@@ -76,6 +81,12 @@ class TwoWays(WithSurface):
         self.register_buffer("turn", torch.eye(4).repeat(num_parts, 1, 1))
         self.register_buffer("scale", torch.ones(num_features))
         self.register_buffer("weight", torch.zeros(num_features))
+
+    @property
+    def temperature(self) -> Tensor | float:
+        """By which the odds of all witnesses are to be divided before they are believed; the last one taught knows."""
+        network = self.near or self.surface
+        return 1.0 if network is None else network.temperature
 
     def twin_poses(
         self,

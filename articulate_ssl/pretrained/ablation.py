@@ -50,7 +50,7 @@ def _no_sides(estimator: PoseEstimator) -> None:
 
 def _no_decision(estimator: PoseEstimator) -> None:
     estimator.two_ways.learnt.fill_(False)
-    estimator.two_ways.surface = None
+    _no_network_that_decides(estimator)
 
 
 def _no_proportions(estimator: PoseEstimator) -> None:
@@ -58,7 +58,11 @@ def _no_proportions(estimator: PoseEstimator) -> None:
 
 
 def _no_network_that_decides(estimator: PoseEstimator) -> None:
-    estimator.two_ways.surface = None
+    estimator.two_ways.surface = estimator.two_ways.near = None
+
+
+def _no_network_from_near(estimator: PoseEstimator) -> None:
+    estimator.two_ways.near = None
 
 
 def _no_network_of_turns(estimator: PoseEstimator) -> None:
@@ -83,12 +87,13 @@ def _no_network_of_views_parts(estimator: PoseEstimator) -> None:
 
 ABLATIONS = (
     Ablation(NOTHING, lambda _: True, lambda _: None),
+    Ablation("the network that sees parts from near", lambda of: of.two_ways.near is not None, _no_network_from_near),
     Ablation(
-        "the network that decides which way round",
+        "networks that decide which way round",
         lambda of: of.two_ways.surface is not None,
         _no_network_that_decides,
     ),
-    Ablation("relief and that network", lambda of: bool(of.two_ways.learnt), _no_decision),
+    Ablation("relief and these networks", lambda of: bool(of.two_ways.learnt), _no_decision),
     Ablation(
         "the network that chooses among leading turns", lambda of: of.sliding.surface is not None, _no_network_of_turns
     ),

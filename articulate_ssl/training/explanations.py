@@ -12,9 +12,12 @@ import torch
 from torch import Tensor
 
 from articulate_ssl.inference.prediction import Prediction, concatenate
+from articulate_ssl.inference.surface_decision import SurfaceDecision
+from articulate_ssl.inference.swapped_parts import PartViews
 from articulate_ssl.inference.two_ways import FEWEST
 from articulate_ssl.ops.progress import announced, tell
 from articulate_ssl.shape.object_axes import object_axes
+from articulate_ssl.training.near_lessons import learn_from_near
 from articulate_ssl.training.surface_lessons import learn_surface
 
 if TYPE_CHECKING:
@@ -48,7 +51,7 @@ def learn_two_ways(
         )
         return
     two_ways = module.estimator.two_ways
-    two_ways.surface = None  # of a run that ended and goes on
+    two_ways.surface = two_ways.near = None  # of a run that ended and goes on
     chosen, rival = _with_rivals(module, clouds[:_RELATED], "two explanations, their relation")
     if two_ways.learn_twin(_object_poses(chosen), _object_poses(rival), chosen.margin):
         _learn_from_relief(module, clouds)
@@ -60,13 +63,12 @@ def learn_two_ways(
 def _learn_from_relief(module: ArticulatedPoseModule, clouds: Tensor) -> None:
     """The decision between twins."""
     estimator, generator = module.estimator, torch.Generator().manual_seed(0)
-    frames, reliefs, noisy_clouds = [], [], []
+    found, noisy_clouds = [], []
     for some in announced(log, "two explanations, their relief", clouds.split(_BATCH)):
         noisy_clouds.append(with_noise(some, generator))
         points = some[:, : registered_points(module)]
-        both, described = estimator.reliefs(points, module.num_points, (some, noisy_clouds[-1]))
-        frames.append(both)
-        reliefs.append(described)
+        found.append(estimator.both_ways(points, module.num_points, (some, noisy_clouds[-1])))
+    frames, reliefs, views = zip(*found, strict=True)
     clean, noisy = ([torch.cat(each) for each in zip(*some, strict=True)] for some in zip(*reliefs, strict=True))
     two_ways = estimator.two_ways
     if not two_ways.learn_decision(clean, noisy):
@@ -76,6 +78,15 @@ def _learn_from_relief(module: ArticulatedPoseModule, clouds: Tensor) -> None:
     favoured = torch.where((odds > 0)[:, None, None, None], frames, frames.flip(1))
     clearest = odds.abs().argsort(descending=True)[: int((odds != 0).sum())]
     two_ways.surface = learn_surface((clouds, torch.cat(noisy_clouds)), favoured, clearest, _UNSURE_AGREE)
+    if views[0] is not None:
+        whole = torch.zeros_like(odds) if two_ways.surface is None else _odds(two_ways.surface, frames, clouds)
+        two_ways.near = learn_from_near(PartViews.concatenate(views), odds > 0, whole, clearest, _UNSURE_AGREE)
+
+
+def _odds(network: SurfaceDecision, frames: Tensor, clouds: Tensor) -> Tensor:  # [n]
+    """Of explanations, and not their twins."""
+    shown = zip(frames.split(_BATCH), clouds.split(_BATCH), strict=True)
+    return torch.cat([network.log_odds(*some) for some in shown])
 
 
 def _learn_from_fits(module: ArticulatedPoseModule, clouds: Tensor, chosen: Prediction, rival: Prediction) -> None:

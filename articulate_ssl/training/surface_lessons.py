@@ -11,6 +11,7 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import roma
 import torch
@@ -124,9 +125,18 @@ def believable(odds: Tensor) -> Tensor:
     return temperatures[functional.softplus(-odds[:, None] / temperatures).mean(dim=0).argmin()]
 
 
-def teach(
-    lessons: Lessons, work: str = "a network learns to decide", size: SurfaceSize | None = None
-) -> SurfaceDecision:
+class Drawn(Protocol):
+    """Lessons, of whatever kind."""
+
+    points: Tensor  # [V, n, ...]
+    mirrored: bool
+    doubt: float
+
+    def draw(self, count: int, size: SurfaceSize, generator: torch.Generator) -> tuple[SurfaceCloud, Tensor]:
+        """Clouds and frames [B', S, 3, 3] in which to see them: by pairs, what is right first."""
+
+
+def teach(lessons: Drawn, work: str = "a network learns to decide", size: SurfaceSize | None = None) -> SurfaceDecision:
     """A new network that has learnt them.
 
     Args:

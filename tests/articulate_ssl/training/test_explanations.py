@@ -135,6 +135,25 @@ def test_no_network_has_a_say_in_the_search_without_one(module, clouds):
     torch.testing.assert_close(after.base_pose, before.base_pose, atol=0, rtol=0)
 
 
+def test_what_relief_says_teaches_exchanged_parts_too(module, clouds, monkeypatch):
+    """Views are of the explanations, in both versions; which are held to be right is what relief says of them."""
+    handed = []
+    monkeypatch.setattr(explanations, "FEWEST", 1)
+    taught(module, 50.0)
+    for step in ("learn_twin", "learn_decision"):
+        monkeypatch.setattr(module.two_ways, step, lambda *_: True)
+    monkeypatch.setattr(explanations, "learn_from_near", lambda *lesson: handed.append(lesson))
+    learn_two_ways(module, clouds)
+    ((views, right, whole, _, least),) = handed
+    assert views.points.shape[:3] == (2, 6, 2) and not torch.equal(views.points[0], views.points[1])
+    count = explanations.registered_points(module)
+    found = module.estimator.both_ways(clouds[:, :count], module.num_points, (clouds,))
+    torch.testing.assert_close(views.frames, found.views.frames, atol=1e-4, rtol=0)
+    assert torch.equal(right, module.two_ways.relief_odds(*found.reliefs[0]) > 0)
+    assert (whole == 0).all() and least > 0.5  # too few for a network that sees whole clouds
+    assert module.two_ways.surface is None and module.two_ways.near is None
+
+
 def test_the_decision_is_taught_with_noise_of_every_strength(module, clouds, monkeypatch):
     seen = []
 
