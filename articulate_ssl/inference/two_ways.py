@@ -6,11 +6,12 @@ for all clouds. So from the relief of both explanations of many clouds (`relief`
 
 1. the *twin* of an explanation: which part lies where the other explanation has which, and how it is turned there.
    This is the same for all clouds, so the most frequent one among the rivals that predictions come with is taken;
-2. the *decision*: a direction in which the differences of reliefs, whose signs nobody knows, fall into two clusters
-   opposite each other: least kurtosis among whitened principal directions, and from there discriminant analysis on
-   its own answers until these stay. Of several starts the one that parts the clusters best wins. Last, discriminant
-   analysis of the same answers on the clouds as they are and with noise on their points, which hides what is fine: what
-   a scanner leaves of it must weigh no more than it is worth;
+2. the *decision*: the differences of reliefs, whose signs nobody knows, are two Gaussians opposite each other, of one
+   covariance. Expectation maximisation finds them, from directions of least kurtosis among whitened principal ones; of
+   many starts the likeliest end wins. Least kurtosis itself, and discriminant analysis on its own answers, took another
+   difference of laptops for the one that counts (docs/experiments.md, step 224). Last, discriminant analysis of the
+   same answers on the clouds as they are and with noise on their points, which hides what is fine: what a scanner
+   leaves of it must weigh no more than it is worth;
 3. the *surface*: a network that sees where relief is, taught by what the second step is sure of (`surface_decision`);
    and where the twin has two hinged parts exchanged another, taught alike, that sees each of them from near
    (`swapped_parts`). Their odds and those of relief are multiplied, as those of several witnesses.
@@ -26,6 +27,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+from collections.abc import Iterator
 
 import numpy as np
 import roma
@@ -50,10 +52,11 @@ _RIDGE = 0.3  # of discriminant analysis, in units of a standardised feature's v
 _CAP = 3.0  # standard deviations, beyond which a feature counts as this far
 _COMPONENTS = (2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24)  # whitened principal directions, tried in turn
 _STARTS, _STEPS, _RATE = 64, 80, 0.15  # of the descent to least kurtosis
-# One search in three ended in a difference of laptops that is right for 85 %, by .015 above the least one, which is
-# right for 93 % (docs/experiments.md, step 219).
-_SEARCHES = 8
-_ROUNDS = 50  # of discriminant analysis at most; a handful is taken
+_SEARCHES = 4  # in each of these numbers of directions, from other starts
+_ROUNDS, _STAYS = 500, 1e-3  # of expectation maximisation at most; and what no answer moves by in the end
+_SLACK = (
+    0.03  # added to the variances of features, in units of one. Chosen: .01 to .1 end alike, of 400 clouds .03 and .1
+)
 
 log = logging.getLogger(__name__)
 
@@ -156,19 +159,50 @@ def decision_direction(
     differences: np.ndarray,  # [n, F] standardised; the sign of each is arbitrary
 ) -> np.ndarray:  # [F]
     """Weights of the logarithm of the odds that a difference is not to be turned round, up to one common sign."""
+    ends = (expectation_maximised(differences, sign) for sign in _starts(differences))
+    _, weight, distance = max(ends, key=lambda end: end[0])
+    tell(log, "the two explanations are %.1f standard deviations from their middle", distance)
+    return weight
+
+
+def expectation_maximised(
+    differences: np.ndarray,  # [n, F] standardised
+    sign: np.ndarray,  # [n] a first answer
+) -> tuple[float, np.ndarray, float]:
+    """Two Gaussians at m and -m of one covariance C, by which differences are turned round or not (McLachlan 2000).
+
+    Second moments S are known whatever the answers are, and C = S - m m^T, so that all that a round asks is m.
+
+    Returns:
+        The logarithm of their likelihood, by what it is above one Gaussian's, a sample's mean; weights [F] of the
+        logarithm of the odds; the distance of m from 0 in standard deviations.
+    """
+    moment = differences.T @ differences / len(differences)
+    inverse = np.linalg.inv(moment + _SLACK * np.eye(len(moment)))
+    answer = sign.astype(float)
+    for _ in range(_ROUNDS):
+        mean = (answer[:, None] * differences).mean(axis=0)
+        weight = inverse @ mean
+        share = mean @ weight  # of the variance along m that m explains
+        odds = differences @ weight / (1 - share)
+        before, answer = answer, np.tanh(odds)
+        if np.abs(answer - before).max() < _STAYS:
+            break
+    log_cosh = np.logaddexp(odds, -odds).mean() - np.log(2)
+    likelihood = log_cosh - 0.5 * (np.log(1 - share) + (weight @ moment @ weight + share) / (1 - share))
+    return float(likelihood), 2 * weight / (1 - share), float(np.sqrt(share / (1 - share)))
+
+
+def _starts(differences: np.ndarray) -> Iterator[np.ndarray]:
+    """Answers [n] of directions of least kurtosis."""
     generator = np.random.default_rng(0)
     _, size, directions = np.linalg.svd(differences, full_matrices=False)
-    least, best = np.inf, None
     for count in _COMPONENTS:
         if count > min(differences.shape) // 2:
             break
         white = differences @ (directions[:count].T / size[:count] * np.sqrt(len(differences)))
         for _ in range(_SEARCHES):
-            weight = _agreeing(differences, np.sign(white @ _least_kurtosis(white, generator)))
-            if (kurtosis := _kurtosis(differences @ weight)) < least:
-                least, best = kurtosis, weight
-    tell(log, "the two explanations part with a kurtosis of %.2f (1: perfectly, 3: not at all)", least)
-    return best
+            yield np.sign(white @ _least_kurtosis(white, generator))
 
 
 def _least_kurtosis(white: np.ndarray, generator: np.random.Generator) -> np.ndarray:
@@ -180,17 +214,6 @@ def _least_kurtosis(white: np.ndarray, generator: np.random.Generator) -> np.nda
         weight -= _RATE * (slope - (slope * weight).sum(axis=0) * weight)
         weight /= np.linalg.norm(weight, axis=0)
     return weight[:, ((white @ weight) ** 4).mean(axis=0).argmin()]
-
-
-def _agreeing(differences: np.ndarray, sign: np.ndarray) -> np.ndarray:
-    """Weights of discriminant analysis, repeated on its own answers until they stay."""
-    for _ in range(_ROUNDS):
-        weight = _discriminant(differences, sign)
-        answer = np.sign(differences @ weight)
-        if (answer == sign).all():
-            break
-        sign = answer
-    return weight
 
 
 def _discriminant(differences: np.ndarray, sign: np.ndarray) -> np.ndarray:

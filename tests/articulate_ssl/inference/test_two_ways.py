@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import roma
 import torch
+from scipy.stats import multivariate_normal
 
 from articulate_ssl.geometry.se3 import se3
 from articulate_ssl.inference import two_ways
 from articulate_ssl.inference.relief import NUM_FEATURES, describe_relief, roughness
-from articulate_ssl.inference.two_ways import TwoWays, decision_direction
+from articulate_ssl.inference.two_ways import TwoWays, decision_direction, expectation_maximised
 
 
 @pytest.fixture
@@ -84,19 +85,40 @@ def test_the_direction_that_parts_two_clusters_is_found_without_labels(generator
     assert max(largest.mean(), 1 - largest.mean()) < 0.6
 
 
-def test_one_search_may_end_elsewhere_and_several_do_not(monkeypatch):
-    """As of laptops, which something else parts nearly as well (docs/experiments.md, step 219)."""
-    monkeypatch.setattr(two_ways, "_STARTS", 4)
-    right = []
-    for searches in (1, 8):
-        monkeypatch.setattr(two_ways, "_SEARCHES", searches)
-        found = []
-        for seed in (0, 2, 3):
-            values, sign = differences(1200, torch.Generator().manual_seed(seed))
-            answer = np.sign(values @ decision_direction(values)) == sign
-            found.append(max(answer.mean(), 1 - answer.mean()))
-        right.append(min(found))
-    assert right[0] < 0.8 < 0.93 < right[1]
+def test_of_two_differences_the_likelier_counts_and_not_the_one_of_least_kurtosis(generator):
+    """As of laptops (docs/experiments.md, step 224): what many numbers show together, not what one shows plainly."""
+    count = 1500
+    values = torch.randn(count, 20, generator=generator, dtype=torch.float64).numpy()
+    plain, common = np.where(torch.rand(2, count, generator=generator).numpy() < 0.5, -1.0, 1.0)
+    values[:, 0] = 2 * plain + np.sign(values[:, 0]) * np.abs(values[:, 0]) ** 0.5
+    values[:, 1:] += 0.5 * common[:, None]
+    values, _ = two_ways._standardised(values)
+    ends = [expectation_maximised(values, sign) for sign in (plain, common)]
+    kurtosis = [two_ways._kurtosis(values @ weight) for _, weight, _ in ends]
+    assert ends[0][0] < ends[1][0] and kurtosis[0] < kurtosis[1]
+    right = (np.sign(values @ decision_direction(values)) == common).mean()
+    assert max(right, 1 - right) > 0.95
+
+
+def test_the_likelihood_never_falls_and_is_that_of_the_mixture(generator, monkeypatch):
+    """Against the density written out, where nothing is added to variances."""
+    monkeypatch.setattr(two_ways, "_SLACK", 0.0)
+    values, sign = differences(400, generator)
+    values = values[:, :5]
+    found = []
+    for rounds in (1, 2, 5, 200):
+        monkeypatch.setattr(two_ways, "_ROUNDS", rounds)
+        found.append(expectation_maximised(values, sign)[0])
+    assert (np.diff(found) > -1e-9).all() and found[-1] > found[0]
+    likelihood, weight, distance = expectation_maximised(values, sign)
+    moment = values.T @ values / len(values)
+    mean = moment @ weight / 2 / (1 + distance**2)  # weight = 2 C^-1 m, and C^-1 m = S^-1 m (1 + distance^2)
+    covariance = moment - np.outer(mean, mean)
+    normal = [multivariate_normal(side * mean, covariance) for side in (1, -1)]
+    mixture = np.logaddexp(*(one.logpdf(values) for one in normal)) - np.log(2)
+    one = multivariate_normal(np.zeros(5), moment).logpdf(values)
+    np.testing.assert_allclose(likelihood, (mixture - one).mean(), atol=1e-4)
+    np.testing.assert_allclose(values @ weight, normal[0].logpdf(values) - normal[1].logpdf(values), atol=1e-6)
 
 
 def test_relief_odds_are_antisymmetric_and_say_how_sure(generator):
