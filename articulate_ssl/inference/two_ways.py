@@ -54,9 +54,8 @@ _COMPONENTS = (2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24)  # whitened pri
 _STARTS, _STEPS, _RATE = 64, 80, 0.15  # of the descent to least kurtosis
 _SEARCHES = 4  # in each of these numbers of directions, from other starts
 _ROUNDS, _STAYS = 500, 1e-3  # of expectation maximisation at most; and what no answer moves by in the end
-_SLACK = (
-    0.03  # added to the variances of features, in units of one. Chosen: .01 to .1 end alike, of 400 clouds .03 and .1
-)
+# Added to the features' variances, in units of one. Chosen: .01 and .1 end alike, but of 400 clouds .01 elsewhere.
+_SLACK = 0.03
 
 log = logging.getLogger(__name__)
 
