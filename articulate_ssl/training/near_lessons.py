@@ -15,8 +15,7 @@ from articulate_ssl.inference.surface_decision import SurfaceDecision
 from articulate_ssl.inference.swapped_parts import SIZE, PartViews, log_odds_from_near
 from articulate_ssl.network.surface_network import SurfaceCloud, SurfaceSize
 from articulate_ssl.ops.progress import tell
-from articulate_ssl.ops.spin_images import SPIN_CHANNELS
-from articulate_ssl.training.surface_lessons import FEWEST, TAUGHT, believable, teach
+from articulate_ssl.training.surface_lessons import FEWEST, TAUGHT, Lessons, believable, drawn_points, teach
 
 _CHUNK = 64  # clouds at a time
 
@@ -24,22 +23,14 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class PartLessons:
-    """Clouds of whose two exchanged parts it is known which is the first.
+class PartLessons(Lessons):
+    """Clouds of whose two exchanged parts it is known which is the first: points, surface and frames as in `PartViews`.
 
-    Attributes:
-        points, surface, frames: As in `PartViews`, the first part first.
-        mirrored, doubt: See `surface_lessons.Lessons`.
+    The first part comes first, and each is seen in the one frame that it has.
     """
 
-    points: Tensor
-    surface: Tensor
-    frames: Tensor
-    mirrored: bool = False
-    doubt: float = 0.0
-
     @staticmethod
-    def of(
+    def of_views(
         views: PartViews,
         right: Tensor,  # [n] whether the explanations that these are of are right, and not their twins
     ) -> PartLessons:
@@ -49,16 +40,13 @@ class PartLessons:
         return PartLessons(views.points[:, rows, first], views.surface[:, rows, first], views.frames[rows, first])
 
     def draw(self, count: int, size: SurfaceSize, generator: torch.Generator) -> tuple[SurfaceCloud, Tensor]:
-        """Both parts of some of the clouds, in versions and of points drawn anew, each in its one frame."""
+        """Both parts of some of the clouds, in versions and of points drawn anew; and the frame of each."""
         versions, clouds, parts, shown, _ = self.points.shape
         chosen = torch.randperm(clouds, generator=generator)[:count].repeat_interleave(parts)[:, None]
         version = torch.randint(versions, (len(chosen) // parts, 1), generator=generator).repeat_interleave(parts, 0)
         part = torch.arange(parts).repeat(len(chosen) // parts)[:, None]
-        # In farthest-point order again, so that what is left after a layer is even.
-        seen = torch.rand(len(chosen), shown, generator=generator).argsort(dim=1)[:, : size.read].sort(dim=1).values
-        points, surface = (x[version, chosen, part, seen].to(self.points) for x in (self.points, self.surface))
-        images, normal = surface.split([SPIN_CHANNELS, 3], dim=-1)
-        return SurfaceCloud.of(points, images, normal, size), self.frames[chosen, part]
+        seen = drawn_points(len(chosen), shown, size.read, generator)
+        return self.cloud((version, chosen, part, seen), size), self.frames[chosen, part]
 
 
 def learn_from_near(
@@ -78,7 +66,7 @@ def learn_from_near(
     if len(taught) < FEWEST:
         tell(log, "no network sees parts from near: that takes %d clouds, there are %d", FEWEST, len(taught))
         return None
-    lessons = PartLessons.of(views.rows(taught), right[taught])
+    lessons = PartLessons.of_views(views.rows(taught), right[taught])
     decision = teach(lessons, "a network learns to tell parts apart", SIZE)
     odds = torch.cat([log_odds_from_near(decision, views.rows(some)) for some in rest.split(_CHUNK)])
     side = 2.0 * right[rest].to(odds) - 1

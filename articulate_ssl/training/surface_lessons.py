@@ -11,7 +11,6 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import roma
 import torch
@@ -77,15 +76,22 @@ class Lessons:
         versions, clouds, shown, _ = self.points.shape
         chosen = torch.randperm(clouds, generator=generator)[:count, None]
         version = torch.randint(versions, chosen.shape, generator=generator)
-        # In farthest-point order again, so that what is left after a layer is even.
-        seen = torch.rand(len(chosen), shown, generator=generator).argsort(dim=1)[:, : size.read].sort(dim=1).values
-        points, surface = (x[version, chosen, seen].to(self.points) for x in (self.points, self.surface))
-        images, normal = surface.split([SPIN_CHANNELS, 3], dim=-1)
+        seen = drawn_points(len(chosen), shown, size.read, generator)
         frames = self.frames[chosen[:, 0]]
         if frames.shape[1] > 2:
             wrong = torch.randint(1, frames.shape[1], (len(frames),), generator=generator)
             frames = torch.stack([frames[:, 0], frames[torch.arange(len(frames)), wrong]], dim=1)
-        return SurfaceCloud.of(points, images, normal, size), frames
+        return self.cloud((version, chosen, seen), size), frames
+
+    def cloud(self, where: tuple[Tensor, ...], size: SurfaceSize) -> SurfaceCloud:
+        """Points and surface at indices of the leading dimensions."""
+        points, surface = (x[where].to(self.points) for x in (self.points, self.surface))
+        return SurfaceCloud.of(points, *surface.split([SPIN_CHANNELS, 3], dim=-1), size)
+
+
+def drawn_points(count: int, shown: int, read: int, generator: torch.Generator) -> Tensor:  # [count, read]
+    """Some of the points of every cloud, in farthest-point order again, so that what is left after a layer is even."""
+    return torch.rand(count, shown, generator=generator).argsort(dim=1)[:, :read].sort(dim=1).values
 
 
 def learn_surface(
@@ -125,18 +131,9 @@ def believable(odds: Tensor) -> Tensor:
     return temperatures[functional.softplus(-odds[:, None] / temperatures).mean(dim=0).argmin()]
 
 
-class Drawn(Protocol):
-    """Lessons, of whatever kind."""
-
-    points: Tensor  # [V, n, ...]
-    mirrored: bool
-    doubt: float
-
-    def draw(self, count: int, size: SurfaceSize, generator: torch.Generator) -> tuple[SurfaceCloud, Tensor]:
-        """Clouds and frames [B', S, 3, 3] in which to see them: by pairs, what is right first."""
-
-
-def teach(lessons: Drawn, work: str = "a network learns to decide", size: SurfaceSize | None = None) -> SurfaceDecision:
+def teach(
+    lessons: Lessons, work: str = "a network learns to decide", size: SurfaceSize | None = None
+) -> SurfaceDecision:
     """A new network that has learnt them.
 
     Args:

@@ -82,7 +82,7 @@ def test_frames_turn_with_the_cloud_and_are_right_handed(both, clouds):
     assert (there.frames - here.frames).abs().amax() > 0.1
 
 
-def test_the_inner_sides_face_each_other_and_the_hinge_is_behind(both, clouds):
+def test_the_inner_sides_face_each_other(both, clouds):
     found = views(*both, clouds)
     middle = found.points[0].mean(dim=2)
     other = middle.flip(1) - middle

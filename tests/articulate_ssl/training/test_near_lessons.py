@@ -72,7 +72,7 @@ def test_few_clouds_and_clouds_of_which_little_is_seen_teach_nothing(monkeypatch
 def test_drawn_parts_come_in_pairs_the_right_one_first():
     """Seen in its frame, the first one is thick at its far end, and no second one is."""
     views, right = pairs(20, 0)
-    cloud, frames = PartLessons.of(views, right).draw(20, TINY, torch.Generator().manual_seed(0))
+    cloud, frames = PartLessons.of_views(views, right).draw(20, TINY, torch.Generator().manual_seed(0))
     assert frames.shape == (40, 1, 3, 3)
     seen = cloud.seen_in(frames).points.view(20, 2, TINY.read, 3)
     far, close = (seen[..., 2].abs() * (sign * seen[..., 1] > 0.05) for sign in (1, -1))
