@@ -137,13 +137,16 @@ def train(method: Method, data: ArticulatedDataModule, folder: Path, seed: int) 
 
 
 def test(method: Method, data: ArticulatedDataModule, folder: Path, trained: dict[str, Any]) -> dict[str, Any]:
-    """Score a trained method on the test clouds and write `metrics.json` and `metrics.csv`; returns their content.
+    """Score a trained method on the test clouds and write `metrics.json`, `metrics.csv` and `objects.csv`.
 
     Args:
         method: Trained.
         data: Whose test clouds.
         folder: Of what is written.
         trained: What `train` returned.
+
+    Returns:
+        The content of `metrics.json`.
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     method.to(device).eval()
@@ -165,6 +168,7 @@ def test(method: Method, data: ArticulatedDataModule, folder: Path, trained: dic
         protocol=manifest.protocol or manifest.view,
         checkpoint=str(folder / WEIGHTS_NAME),
         seconds_per_cloud=seconds / result["samples"],
+        per_object=(metrics.per_object(), manifest.instances["test"]),
         method=method.title,
         given=list(method.given),
         says=list(method.says),

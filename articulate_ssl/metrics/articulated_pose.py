@@ -36,6 +36,7 @@ from articulate_ssl.metrics.functional import (
     translation_error,
 )
 from articulate_ssl.metrics.kinematic_tree import root_correct, tree_correct
+from articulate_ssl.metrics.objects import CLOUDS, NUMBER
 from articulate_ssl.metrics.statistics import summarize
 from articulate_ssl.metrics.symmetry import measured_symmetries, pool, rest_clouds, symmetric_rotation_error
 
@@ -235,19 +236,38 @@ class ArticulatedPoseMetrics(Metric):
         result: dict = {}
         for name in (*PER_PART, *PER_JOINT, *PER_CLOUD):
             values = at_the_end[name] if name in AT_THE_END else dim_zero_cat(getattr(self, name))
-            if values.ndim == 1:
-                result[name] = self._summary(values, instance)
-                continue
-            average = values.amax(1) if name in ANY_PART else values.nanmean(1)
-            if name == "state_err" and len({*self.calibration.joint_type.tolist()}) > 1:
-                average = torch.full_like(average, torch.nan)  # degrees and lengths have no common mean
-            result[name] = self._summary(average, instance)
-            single = "parts" if name in PER_PART else "joints"
-            result[name][single] = [self._summary(column, instance) for column in values.unbind(1)]
+            result[name] = self._summary(self._of_clouds(name, values), instance)
+            if values.ndim > 1:
+                single = "parts" if name in PER_PART else "joints"
+                result[name][single] = [self._summary(column, instance) for column in values.unbind(1)]
         said = {name: getattr(self, name) for name in ("margin", "probability")}
         errors = dim_zero_cat(self.r_err_deg)
         confidence = {k: report_confidence(dim_zero_cat(v), errors) if len(v) else None for k, v in said.items()}
         return result | {"samples": len(instance), "failures": 0} | counts | confidence
+
+    def per_object(self) -> dict[str, Tensor]:
+        """Means over the clouds of every object; of all processes, so every one has to ask.
+
+        Returns:
+            `instance` [I] of the labels and `samples` [I], its clouds; by the name of an error [I] the mean of each
+            cloud's average, NaN where it does not exist. `AT_THE_END` is missing.
+        """
+        with self.sync_context(dist_sync_fn=self.dist_sync_fn):
+            instance, row = dim_zero_cat(self.instance).cpu().unique(return_inverse=True)
+            found = {NUMBER: instance, CLOUDS: row.bincount()}
+            for name in (*PER_PART, *PER_JOINT, *PER_CLOUD):
+                if name not in AT_THE_END:
+                    values = self._of_clouds(name, dim_zero_cat(getattr(self, name))).cpu()
+                    found[name] = _means(values, row, len(instance))
+        return found
+
+    def _of_clouds(self, name: str, values: Tensor) -> Tensor:  # [S]
+        """Of values of clouds, or of their parts or joints, the average of each cloud."""
+        if values.ndim == 1:
+            return values
+        if name == "state_err" and len({*self.calibration.joint_type.tolist()}) > 1:
+            return torch.full_like(values[:, 0], torch.nan)  # degrees and lengths have no common mean
+        return values.amax(1) if name in ANY_PART else values.nanmean(1)
 
     def _modulo_symmetry(self, instance: Tensor) -> tuple[dict[str, Tensor], dict[str, int]]:
         """`AT_THE_END`, every one [S, K], and how many instances there are and are symmetric."""
@@ -266,3 +286,10 @@ class ArticulatedPoseMetrics(Metric):
 
     def _summary(self, values: Tensor, instance: Tensor) -> dict:
         return summarize(values, instance, self.replicates, self.seed)
+
+
+def _means(values: Tensor, row: Tensor, rows: int) -> Tensor:
+    """Means [rows] of the values [S] of each row that exist; NaN where none does."""
+    exists = ~values.isnan()
+    total = torch.zeros(rows, dtype=values.dtype).index_add(0, row[exists], values[exists])
+    return total / row[exists].bincount(minlength=rows)

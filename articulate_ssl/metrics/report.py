@@ -5,12 +5,14 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
+from torch import Tensor
 
+from articulate_ssl.metrics import objects
 from datamodules.atomic import atomic_write
 
 JSON_NAME = "metrics.json"
@@ -76,9 +78,12 @@ def write_report(
     protocol: str | None,
     checkpoint: str | None,
     seconds_per_cloud: float | None,
+    per_object: tuple[dict[str, Tensor], Sequence[str]] | None = None,
     **meta: object,
 ) -> dict:
     """Write `metrics.json` and `metrics.csv` into a folder (each appears whole or not at all), and print the table.
+
+    What is known of single objects goes to `objects.csv`.
 
     Args:
         folder: Made if missing.
@@ -88,6 +93,7 @@ def write_report(
         protocol: `complete`, `honest` or `eap`.
         checkpoint: Path of the weights; None for a method without weights.
         seconds_per_cloud: Inference time.
+        per_object: What `ArticulatedPoseMetrics.per_object` returned, and the ids of the objects.
         **meta: Anything else worth keeping that JSON can hold, e.g. `calibration`; `part_names` (K strings) also head
             the rows of table and CSV.
 
@@ -105,10 +111,15 @@ def write_report(
     folder = Path(folder)
     text = json.dumps(content, indent=2, allow_nan=False)
     folder.mkdir(parents=True, exist_ok=True)
-    for name, body in ((JSON_NAME, text + "\n"), (CSV_NAME, as_csv(content))):
+    files = {JSON_NAME: text + "\n", CSV_NAME: as_csv(content)}
+    if per_object is not None:
+        files[objects.CSV_NAME] = objects.as_csv(*per_object)
+    for name, body in files.items():
         with atomic_write(folder / name) as file:
             file.write(body.encode())
     Console().print(as_table(content))
+    if per_object is not None and (said := objects.half_of_flips(*per_object)):
+        Console().print(said)
     return content
 
 

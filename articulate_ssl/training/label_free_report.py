@@ -55,12 +55,16 @@ class LabelFreeReport:
         self.seconds += seconds
         self._clouds.append((batch["points"].cpu(), batch["sample"].cpu(), prediction.to("cpu")))
 
+    def compute(self) -> dict:
+        """Statistics of all clouds; on every process, as they are gathered."""
+        return self.metrics.compute()
+
     def write(self, folder: Path, result: dict, manifest: Manifest, checkpoint: str, refined: bool) -> dict:
         """Write metrics.json, metrics.csv and the picture (of this process's clouds); print the table.
 
         Args:
             folder: Where to.
-            result: What `metrics.compute()` returned.
+            result: What `compute` returned.
             manifest: Of the test set.
             checkpoint: Path of the weights.
             refined: Whether predictions were refined by registration.

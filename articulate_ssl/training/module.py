@@ -412,10 +412,10 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         return batch | {"points": batch["dense_points"][:, :count]}
 
     def on_test_end(self) -> None:
-        """Write metrics.json, metrics.csv and the picture of best, median and worst samples."""
+        """Write metrics.json, metrics.csv, objects.csv and the picture of best, median and worst samples."""
         folder = Path(self.trainer.log_dir or self.trainer.default_root_dir)
         data = self.trainer.datamodule
-        metrics = self.test_report.metrics.compute()  # on every rank: it gathers
+        metrics = self.test_report.compute()  # on every rank: it gathers
         compared = () if self.test_columns is None else (self.test_columns.compute(metrics, self.test_report),)
         if self.recipe.multi_state:
             metrics = {"setting": MULTI_STATE} | metrics

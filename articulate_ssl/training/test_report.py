@@ -67,6 +67,12 @@ class TestReport:
             (batch["points"].cpu(), batch["dense_part_id"].gather(1, nearest).cpu(), prediction.to("cpu"))
         )
 
+    def compute(self) -> dict:
+        """Statistics of all clouds; on every process, as they are gathered."""
+        found = self.metrics.compute()
+        self._per_object = self.metrics.per_object()
+        return found
+
     def write(
         self,
         folder: Path,
@@ -76,11 +82,11 @@ class TestReport:
         refined: bool,
         columns: dict[str, dict] | None = None,
     ) -> dict:
-        """Write metrics.json, metrics.csv and the picture (of this process's clouds); print the table.
+        """Write metrics.json, metrics.csv, objects.csv and the picture (of this process's clouds); print the table.
 
         Args:
             folder: Where to.
-            result: What `metrics.compute()` returned.
+            result: What `compute` returned.
             manifest: Of the test set.
             checkpoint: Path of the weights.
             refined: Whether predictions were refined by registration.
@@ -98,6 +104,7 @@ class TestReport:
             protocol=manifest.protocol or manifest.view,
             checkpoint=checkpoint,
             seconds_per_cloud=self.seconds / max(1, sum(len(points) for points, *_ in self.samples)),
+            per_object=(self._per_object, manifest.instances["test"]),
             part_names=list(manifest.part_names),
             refined=refined,
             calibration=self.calibration.to_dict(),

@@ -59,7 +59,9 @@ def test_a_test_writes_its_metrics(run, workplace):
     assert code == 0
     found = list((workplace / "runs").rglob("metrics.json"))
     assert len(found) == 1
-    assert {p.name for p in found[0].parent.iterdir()} >= {"metrics.json", "metrics.csv", "test_samples.png"}
+    assert {p.name for p in found[0].parent.iterdir()} >= {
+        *("metrics.json", "metrics.csv", "objects.csv", "test_samples.png")
+    }
     metrics = json.loads(found[0].read_text())
     statistics = ("r_err_deg", "t_err", "axis_err_deg", "pivot_err", "state_err", "seg_miou", "chamfer_l1", "flip_rate")
     for name in (*statistics, "legacy_r_err_deg"):

@@ -333,7 +333,7 @@ def score_rank(rank: int, folder: str) -> None:
     mine = torch.arange(15) if rank == 0 else torch.arange(15, 24)
     for clouds in mine.split(4):
         metrics.update(noisy[clouds], part_of(labels, clouds))
-    torch.save(metrics.compute(), f"{folder}/rank{rank}.pt")
+    torch.save((metrics.compute(), metrics.per_object()), f"{folder}/rank{rank}.pt")
     dist.destroy_process_group()
 
 
@@ -342,7 +342,9 @@ def test_two_ranks_with_unequal_shares_equal_one_process(tmp_path):
     noisy, labels, metrics = noisy_world()
     metrics.update(noisy, labels)
     for rank in range(2):
-        assert_same(metrics.compute(), torch.load(tmp_path / f"rank{rank}.pt", weights_only=True))
+        gathered, per_object = torch.load(tmp_path / f"rank{rank}.pt", weights_only=True)
+        assert_same(metrics.compute(), gathered)
+        torch.testing.assert_close(per_object, metrics.per_object(), equal_nan=True)
 
 
 def test_a_mixed_precision_prediction_is_scored():

@@ -2,10 +2,12 @@ import csv
 import json
 
 import pytest
+import torch
 from articulated_world import articulated_labels
 
 from articulate_ssl.baselines.perfect_oracle import perfect_oracle
 from articulate_ssl.metrics import ArticulatedPoseMetrics, calibrate
+from articulate_ssl.metrics.objects import CSV_NAME as OBJECTS_NAME
 from articulate_ssl.metrics.report import CSV_NAME, JSON_NAME, MULTI_STATE, write_report
 
 META = {
@@ -48,6 +50,14 @@ def test_table_speaks_percent_and_degrees(tmp_path, metrics, capsys):
     assert "100.0 %" in printed
     assert "r_err_deg" in printed
     assert "24 clouds, 0 failures" in printed
+
+
+def test_what_is_known_of_single_objects_has_a_file_and_flips_a_sentence(tmp_path, metrics, capsys):
+    rate = torch.tensor([0.0, 0.5], dtype=torch.float64)
+    objects = {"instance": torch.tensor([0, 1]), "samples": torch.tensor([12, 12]), "r_err_deg": rate}
+    write_report(tmp_path, metrics, **META, per_object=(objects | {"flip_rate": rate}, ["narrow", "wide"]))
+    assert (tmp_path / OBJECTS_NAME).read_text().splitlines()[1] == "wide,12,0.5,0.5"
+    assert "6 of 6 flips are of 1 of 2 objects: wide" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_setting_that_is_not_the_usual_one_is_named(tmp_path, metrics, capsys):
