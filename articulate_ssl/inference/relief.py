@@ -18,6 +18,7 @@ from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.inference.packaging import joint_lines
 from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.ops.kd_tree import kd_tree
+from articulate_ssl.ops.least_variance import least_variance
 from articulate_ssl.shape.stretch import principal_directions
 
 # Normalised units from a revolute joint's line. On laptops labels near the hinge are a matter of taste; of 400 clouds
@@ -61,13 +62,7 @@ def roughness(
 ) -> np.ndarray:  # [m, 2]
     """Logarithm of every point's neighbourhoods' standard deviation from their planes."""
     neighbours = kd_tree(points).query(points, k=max(_NEIGHBOURS))[1]
-    values = []
-    for count in _NEIGHBOURS:
-        patch = points[neighbours[:, :count]]
-        patch = patch - patch.mean(axis=1, keepdims=True)
-        variance = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", patch, patch) / count)[:, 0]
-        values.append(np.log(np.sqrt(np.maximum(variance, 0)) + 10 * _LEAST))
-    return np.stack(values, axis=1)
+    return np.log(np.sqrt(least_variance(points, neighbours, _NEIGHBOURS)) + 10 * _LEAST)
 
 
 def _part(points: np.ndarray, total: int, pose: np.ndarray, axes: np.ndarray) -> np.ndarray:

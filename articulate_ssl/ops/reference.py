@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import layer_norm, leaky_relu
@@ -179,3 +181,17 @@ def _tangent_plane(
     centred = (offset - middle[..., None, :]) / RADIUS
     covariance = (weight[..., None] * centred).transpose(-1, -2) @ centred
     return middle, torch.linalg.eigh(covariance).eigenvectors[..., 0]
+
+
+def least_variance(
+    points: np.ndarray,  # [m, 3]
+    neighbours: np.ndarray,  # [m, n]
+    counts: Sequence[int],
+) -> np.ndarray:  # [m, len(counts)]
+    """The least eigenvalue of the covariance of every point's leading neighbours."""
+    found = []
+    for count in counts:
+        patch = points[neighbours[:, :count]]
+        patch = patch - patch.mean(axis=1, keepdims=True)
+        found.append(np.linalg.eigvalsh(patch.transpose(0, 2, 1) @ patch / count)[:, 0])
+    return np.stack(found, axis=1)
