@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from articulate_ssl.geometry.screw import REVOLUTE
-from articulate_ssl.inference.hinge_sides import Bodies
+from articulate_ssl.inference.hinge_sides import DECIDED, Bodies
 from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.ops.progress import announced, tell
 from articulate_ssl.training.explanations import registered_points, with_noise
@@ -34,7 +34,7 @@ _FIRST, _KNOWN = 64, 0.9
 _VIEWS = 256  # of an upright camera, from which nothing is learnt but a direction and a share. Chosen.
 # Shares of the clouds that the network was not taught by. Chosen: fewer that are turned are not worth a network; more
 # would mean that most are not right; and one that cannot tell sides apart is undecided of many.
-_LEAST_TURNED, _MOST_TURNED, _MOST_UNDECIDED, _DECIDED = 0.02, 0.4, 0.15, 2.0
+_LEAST_TURNED, _MOST_TURNED, _MOST_UNDECIDED = 0.02, 0.4, 0.15
 _RARE = 1e-3  # least share of a side
 _SHARES = 50  # rounds of expectation and maximisation
 
@@ -119,7 +119,7 @@ def _learnt(module: ArticulatedPoseModule, bodies: Bodies) -> bool:
     share = _shares(odds)
     believed = odds + share.log()
     best = believed.topk(2, dim=1).values
-    undecided, other = float((best[:, 0] - best[:, 1] < _DECIDED).double().mean()), float(1 - share[0])
+    undecided, other = float((best[:, 0] - best[:, 1] < DECIDED).double().mean()), float(1 - share[0])
     percent = (100 * share).round().int().tolist()
     tell(log, "hinge sides, by %s: %s %% of the clouds, undecided %.0f %%", seen, percent, 100 * undecided)
     sides.log_prior.zero_()

@@ -216,6 +216,22 @@ def test_a_lying_object_stands_up():
     torch.testing.assert_close(kept.base_pose, prediction.base_pose)
 
 
+@pytest.mark.parametrize(("doors", "likelier", "turns"), [(False, 2.1, 1), (False, 1.9, 0), (True, 0.1, 2)])
+def test_what_is_undecided_of_a_body_stays_and_doors_are_believed(doors, likelier, turns):
+    prediction, dense, _ = _lying([2] if doors else [1], knob=doors)
+    sides = _sides()
+    sides.doors.fill_(doors)
+    sides.closed.zero_()
+    sides.surface = _TopIsUp(up=0, size=DOOR_SIZE) if doors else _TopIsUp()
+    looks = sides.looks_right(sides.bodies(prediction, dense, (dense,)))[0]
+    sides.log_prior.fill_(-1e6)
+    sides.log_prior[:2] = likelier * torch.arange(2.0) - looks[:2]
+    decided, quarters = sides.decided(prediction, dense)
+    assert quarters.tolist() == [turns]
+    assert float(decided.margin) == pytest.approx(math.tanh(likelier / 2), abs=1e-2)
+    _same_in_camera_space(decided, prediction)
+
+
 @pytest.mark.parametrize("opened", [0.3, 1.2, 2.2])
 def test_upside_down_is_told_by_doors_too(opened):
     prediction, dense, true = _lying([0, 2, 2], opened, knob=True)
