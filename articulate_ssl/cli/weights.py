@@ -1,4 +1,4 @@
-"""`articulate-ssl weights list|show|pack|rebuild|teach|check|ablate|columns`: weights that come with the package."""
+"""`articulate-ssl weights list|show|pack|rebuild|teach|check|test|ablate|columns`: those that come with the package."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from articulate_ssl.cli import BAD_INPUT
 from articulate_ssl.inference.checkpoint_file import CheckpointError
 from articulate_ssl.training.shipped_weights import WEIGHTS_FOLDER, shipped_as, shipped_weights
 from articulate_ssl.training.weights_card import CARD_SUFFIX, HEADLINES, VIEWS, WeightsCard
+from datamodules.manifest import ManifestError
 
 # Of `HEADLINES`, as short as a table of all weights needs them.
 _HEADINGS = ("R", ">30°", "flips", "T", "axis", "pivot", "state", "mIoU")
@@ -23,6 +24,7 @@ _BUILD = Path("build/weights")
 _LESSONS = Path("build/weights-teach")
 _CHECKS = Path("build/weights-check")
 _CHECK_SEED = 12
+_TESTS = Path("build/weights-test")
 _ABLATIONS = Path("build/weights-ablate")
 _ABLATION_SEED, _ABLATION_SAMPLES = 57, 240
 
@@ -39,14 +41,14 @@ def run(arguments: list[str]) -> int:
     args = _parser().parse_args(arguments[1:])
     try:
         return args.do(args)
-    except (CheckpointError, OSError) as error:
+    except (CheckpointError, ManifestError, OSError) as error:
         print(f"articulate-ssl weights: {error}", file=sys.stderr)
         return BAD_INPUT
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="articulate-ssl weights", description="Weights that come with the package.")
-    commands = parser.add_subparsers(required=True, metavar="list|show|pack|rebuild|teach|check|ablate|columns")
+    commands = parser.add_subparsers(required=True, metavar="list|show|pack|rebuild|teach|check|test|ablate|columns")
     listed = commands.add_parser("list", help="which there are, and what they are worth")
     listed.add_argument("--markdown", choices=list(VIEWS), metavar="VIEW", help="README's table of one view instead")
     listed.set_defaults(do=_list)
@@ -82,6 +84,14 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("--seed", type=int, default=_CHECK_SEED, help=f"of the fresh data (default: {_CHECK_SEED})")
     check.add_argument("--build", type=Path, default=_CHECKS, help=f"for data and results (default: {_CHECKS})")
     check.set_defaults(do=_check)
+
+    test = commands.add_parser("test", help="on labelled objects of yours, or CAD: a set that `make data` made")
+    test.add_argument("names", nargs="+", help="categories or names")
+    test.add_argument("--source", required=True, help="of the set: partnet-mobility, shape2motion, urdf, hoi4d")
+    test.add_argument("--root", type=Path, default=Path("data"), help="where sets lie (default: data)")
+    test.add_argument("--samples", type=int, help="test clouds at most (default: all)")
+    test.add_argument("--build", type=Path, default=_TESTS, help=f"for calibration and results (default: {_TESTS})")
+    test.set_defaults(do=_test)
 
     ablate = commands.add_parser("ablate", help="what is lost without each thing that was learnt after training")
     ablate.set_defaults(do=_ablate)
@@ -186,6 +196,15 @@ def _check(args: argparse.Namespace) -> int:
     if more_than_chance(found):
         print("more are worse than chance explains: the cards do not hold")
         return _NOT_REPRODUCED
+    return 0
+
+
+def _test(args: argparse.Namespace) -> int:
+    from articulate_ssl.pretrained.elsewhere import measured_elsewhere
+
+    for weights in [weights for name in args.names for weights in _named(name)]:
+        _, place = measured_elsewhere(weights, args.source, args.root, args.build, _say, args.samples)
+        print(f"{weights.name}: {place}/metrics.json, objects.csv and a picture")
     return 0
 
 
