@@ -56,8 +56,8 @@ _PLANES = 3  # times that a door's plane is found, and its points by that. Chose
 # Behind the closed door's plane, in normalised units. With .04 fewer are found (docs/experiments.md, step 124).
 _BEHIND = 0.12
 # By how much likelier, as a logarithm, a body has to look when it is turned: what is less is undecided, and stays. The
-# network of bodies is taught without doubt, and surer than it is right: of dishwashers, which no lesson showed, it
-# turned half upside down, by .6 to 1.5, while ovens are told by 10 and more (step 227). Chosen before that.
+# network of bodies is taught without doubt, and surer than it is right: a dishwasher, whose like no lesson showed, it
+# turned upside down in half of its clouds, by .6 to 1.5; ovens are told by 10 and more (step 227). Chosen before.
 DECIDED = 2.0
 _CLOSED_REACH = math.radians(120)  # from the middle of the joint's range: the closed door is not farther. Chosen.
 
