@@ -188,7 +188,7 @@ class HingeSides(WithSurface):
         """The same, its frame turned so that it stands, or what is seen of it looks right.
 
         Its margin is at most how sure it is that it does. Where too little is seen of it, nothing is decided; bodies
-        that look hardly more right in another way stay, too.
+        that look hardly more right in another way stay, too, with a margin of 0.
 
         Returns:
             That, and by how many quarters frames were turned.
@@ -202,10 +202,10 @@ class HingeSides(WithSurface):
         bodies = self.bodies(prediction, dense, (dense,))
         odds = self.looks_right(bodies) + self.log_prior[: len(self.quarters)].to(dense)
         best, ways = odds.topk(2, dim=1)
-        sure = (best[:, 0] - best[:, 1]) / (2 * self.surface.temperature)
+        undecided = (ways[:, 0] > 0) & (best[:, 0] - odds[:, 0] < (0.0 if self.doors else DECIDED))
+        sure = torch.where(undecided, 0.0, (best[:, 0] - best[:, 1]) / (2 * self.surface.temperature))
         sure = torch.where(bodies.known, sure, torch.inf).tanh()
-        told = bodies.known & (best[:, 0] - odds[:, 0] >= (0.0 if self.doors else DECIDED))
-        quarters = torch.where(told, self.quarters[ways[:, 0]], 0)
+        quarters = torch.where(bodies.known & ~undecided, self.quarters[ways[:, 0]], 0)
         turned = turned_about(prediction, bodies.normal, quarters)
         return replace(turned, margin=prediction.margin.minimum(sure)), quarters
 
