@@ -57,7 +57,8 @@ _PLANES = 3  # times that a door's plane is found, and its points by that. Chose
 _BEHIND = 0.12
 # By how much likelier, as a logarithm, a body has to look when it is turned: what is less is undecided, and stays. The
 # network of bodies is taught without doubt, and surer than it is right: a dishwasher, whose like no lesson showed, it
-# turned upside down in half of its clouds, by .6 to 1.5; ovens are told by 10 and more (step 227). Chosen before.
+# turned upside down in half of its clouds, by .6 to 1.5; most ovens are told by 10 and more (step 227). Chosen earlier,
+# for lessons, of which it says what they leave undecided.
 DECIDED = 2.0
 _CLOSED_REACH = math.radians(120)  # from the middle of the joint's range: the closed door is not farther. Chosen.
 

@@ -44,6 +44,7 @@ class TestReport:
         self.metrics = ArticulatedPoseMetrics(self.calibration)
         self.samples: list[tuple[Tensor, Tensor, Prediction]] = []
         self.seconds, self.upright = 0.0, upright
+        self._per_object: dict[str, Tensor] = {}
 
     def to(self, device: torch.device) -> TestReport:
         """Move calibration and metric states."""

@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import pytest
 import torch
 import yaml
 from synthetic import write_synthetic_set
 from tiny import POINTS, fit, tiny_module
 
 from articulate_ssl.metrics.statistics import summarize
+from articulate_ssl.pretrained import check
 from articulate_ssl.pretrained.pack import PROFILES
 from articulate_ssl.training.module import ArticulatedPoseModule
 from articulate_ssl.training.shipped_weights import ShippedWeights
@@ -76,6 +79,19 @@ def shipped_in(folder: Path, network: ArticulatedPoseModule, command: str) -> Sh
         date="2026-01-02",
     ).save(folder / "laptop-complete.json")
     return weights
+
+
+def stand_in_generator(monkeypatch: pytest.MonkeyPatch, seed: int = 12) -> list[list[str]]:
+    """Lets a synthetic set stand in for whatever data a card's command asks for; returns the commands as they come."""
+    commands = []
+
+    def run(command: list[str], **_: object) -> SimpleNamespace:
+        commands.append(command)
+        write_synthetic_set(command[command.index("--out") + 1], seed=seed)
+        return SimpleNamespace(returncode=0)
+
+    monkeypatch.setattr(check.subprocess, "run", run)
+    return commands
 
 
 def write_run(folder: Path) -> Path:

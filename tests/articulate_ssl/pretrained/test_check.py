@@ -4,8 +4,7 @@ import json
 import math
 
 import pytest
-from packable import made_up_metrics, shipped_in, trained
-from synthetic import write_synthetic_set
+from packable import made_up_metrics, shipped_in, stand_in_generator, trained
 
 from articulate_ssl.inference.checkpoint_file import CheckpointError
 from articulate_ssl.pretrained import check as module
@@ -58,14 +57,7 @@ def shipped(tmp_path):
 
 
 def test_weights_are_tested_on_data_of_another_seed_once(shipped, tmp_path, monkeypatch):
-    made = []
-
-    def run(command, **_):
-        made.append(command)
-        write_synthetic_set(command[command.index("--out") + 1], seed=12)
-        return type("Done", (), {"returncode": 0})
-
-    monkeypatch.setattr(module.subprocess, "run", run)
+    made = stand_in_generator(monkeypatch)
     found = check(shipped, 12, tmp_path / "build", print)
     assert check(shipped, 12, tmp_path / "build", print) == found and len(made) == 1
     words = made[0]

@@ -4,11 +4,11 @@ import csv
 import json
 
 import pytest
-from packable import shipped_in, trained
+from packable import shipped_in, stand_in_generator, trained
 from synthetic import write_synthetic_set
 
 from articulate_ssl.cli import main
-from articulate_ssl.pretrained import check, elsewhere
+from articulate_ssl.pretrained import elsewhere
 from articulate_ssl.pretrained.elsewhere import CALIBRATION_SEED, measured_elsewhere
 from articulate_ssl.training import shipped_weights
 from datamodules.manifest import MANIFEST_NAME, ManifestError
@@ -19,15 +19,7 @@ COMMAND = "python -m render.generate --category laptop --seed 11 --train-instanc
 @pytest.fixture
 def shipped(tmp_path, monkeypatch):
     """Weights of a tiny module with a card, and a stand-in for the generator."""
-    made = []
-
-    def run(command, **_):
-        made.append(command)
-        write_synthetic_set(command[command.index("--out") + 1], seed=12)
-        return type("Done", (), {"returncode": 0})
-
-    monkeypatch.setattr(check.subprocess, "run", run)
-    return shipped_in(tmp_path, trained(tmp_path), COMMAND), made
+    return shipped_in(tmp_path, trained(tmp_path), COMMAND), stand_in_generator(monkeypatch)
 
 
 def other_objects(root, **changes) -> None:
