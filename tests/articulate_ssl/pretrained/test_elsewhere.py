@@ -22,9 +22,9 @@ def shipped(tmp_path, monkeypatch):
     return shipped_in(tmp_path, trained(tmp_path), COMMAND), stand_in_generator(monkeypatch)
 
 
-def other_objects(root, **changes) -> None:
+def other_objects(root, test_instances: int = 2, **changes) -> None:
     """A synthetic set, as if its objects were CAD."""
-    folder = write_synthetic_set(root, seed=3)
+    folder = write_synthetic_set(root, seed=3, test_instances=test_instances)
     folder = folder.rename(folder.with_name("partnet-mobility-complete"))
     manifest = json.loads((folder / MANIFEST_NAME).read_text())
     (folder / MANIFEST_NAME).write_text(json.dumps(manifest | {"source": "partnet-mobility"} | changes))
@@ -53,6 +53,9 @@ def test_what_cannot_be_tested_says_why_before_anything_is_generated(shipped, tm
     other_objects(tmp_path / "data", labelled=False)
     with pytest.raises(ManifestError, match="no labels to compare with"):
         measured_elsewhere(weights, *where)
+    other_objects(tmp_path / "untested", test_instances=0)
+    with pytest.raises(ManifestError, match="no test clouds; make it with"):
+        measured_elsewhere(weights, where[0], tmp_path / "untested", *where[2:])
     assert not made
 
 
