@@ -1,10 +1,14 @@
-"""What `inference.confidence` is learnt from: do predictions of a cloud, turned and sampled again, agree?"""
+"""What `inference.confidence` is learnt from: do predictions of a cloud, turned and sampled again, agree?
+
+And do they, if it is stretched besides? Stretched along the axes of its base, an object stands as it stood and has the
+same parts, but is unlike those of training, as are objects that these did not span.
+"""
 
 from __future__ import annotations
 
 import logging
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import roma
 import torch
@@ -26,6 +30,7 @@ _SAMPLED = 0.6  # share of a cloud's points that the second prediction is drawn 
 # Upright cameras tilt, but not much: within an orientation range, clouds are turned by so much more. Chosen.
 _TILT = math.radians(20)
 _SAME_PARTS = 0.75  # share of the points that must stay in their part; a plate taken for another loses about half
+_STRETCH = 2.0  # at most, either way, along each axis. Chosen.
 _BATCH = 16
 
 log = logging.getLogger(__name__)
@@ -76,23 +81,67 @@ def agree(
     return same & (angle < math.radians(ABOVE_DEG))
 
 
+def stretches(
+    prediction: Prediction,
+    points: Tensor,  # [B, N, 3] that it labels
+    generator: torch.Generator,
+) -> Tensor:  # [B, 3, 3] symmetric
+    """Random stretches along the principal axes of each base's points, which leave the clouds as large as they are."""
+    parts = prediction.num_parts
+    base = parts * (parts - 1) // 2 - prediction.joint_child.sum(dim=1)  # the one that is no joint's child
+    of_base = (prediction.part_id == base[:, None])[..., None]
+    center = (points * of_base).sum(dim=1, keepdim=True) / of_base.sum(dim=1, keepdim=True).clamp(min=1)
+    offset = (points - center) * of_base
+    axes = torch.linalg.eigh(offset.mT @ offset).eigenvectors
+    most = math.log(_STRETCH) * torch.rand(len(points), 1, generator=generator)
+    factor = (most * (2 * torch.rand(len(points), 3, generator=generator) - 1)).exp().to(points)
+    stretch = axes * factor[:, None] @ axes.mT
+    size, stretched_size = (cloud.norm(dim=-1).mean(dim=1) for cloud in (points, points @ stretch))
+    return stretch * (size / stretched_size)[:, None, None]
+
+
+class Looks(NamedTuple):
+    """Predictions of n clouds: relative errors, margins, and whether another look agrees; each [n]."""
+
+    error: Tensor
+    margin: Tensor
+    agrees: Tensor
+
+
 @torch.no_grad()
-def look_twice(
+def look_again(
     module: ArticulatedPoseModule,
     clouds: Tensor,  # [n, N, 3] farthest-point order, dense
-) -> tuple[Tensor, Tensor, Tensor]:  # [n] each
-    """Relative errors and margins of the clouds' predictions, and whether a second look agrees."""
-    generator = torch.Generator().manual_seed(0)
+) -> tuple[Looks, Looks]:
+    """At the clouds, turned and sampled again; and at the same, stretched besides."""
+    generator, stretching = torch.Generator().manual_seed(0), torch.Generator().manual_seed(1)
     count = max(module.num_points, module.inference.points)
-    found = []
+    found: tuple[list[Looks], list[Looks]] = [], []
     for some in announced(log, "learning confidence", clouds.split(_BATCH)):
-        again, turn = another_look(some, module.orientation.limited, generator)
-        points = some[:, :count], again[:, :count]
-        first, second = (module.predict_points(p, dense=whole) for p, whole in zip(points, (some, again), strict=True))
-        found.append((relative_error(first, points[0]), first.margin, agree(first, second, points, turn)))
-    error, margin, agrees = (torch.cat(values) for values in zip(*found, strict=True))
-    tell(log, "%d of %d training clouds are predicted alike a second time", int(agrees.sum()), len(agrees))
-    return error, margin, agrees
+        points = some[:, :count]
+        first = module.predict_points(points, dense=some)
+        second, seen, turn = _predict_again(module, some, count, generator)
+        alike = agree(first, second, (points, seen), turn)
+        found[0].append(Looks(relative_error(first, points), first.margin, alike))
+        stretch = stretches(first, points, stretching)
+        second, seen, turn = _predict_again(module, some @ stretch, count, stretching)
+        alike = agree(first, second, (points @ stretch, seen), turn)
+        found[1].append(Looks(relative_error(second, seen), second.margin, alike))
+    plain, stretched = (Looks(*map(torch.cat, zip(*looks, strict=True))) for looks in found)
+    told = int(plain.agrees.sum()), len(clouds), int(stretched.agrees.sum())
+    tell(log, "%d of %d training clouds are predicted alike a second time, stretched %d", *told)
+    return plain, stretched
+
+
+def _predict_again(
+    module: ArticulatedPoseModule,
+    clouds: Tensor,  # [B, N, 3]
+    count: int,
+    generator: torch.Generator,
+) -> tuple[Prediction, Tensor, Tensor]:
+    """The prediction of another look at clouds, the points [B, count, 3] that it labels, and their turn [B, 3, 3]."""
+    again, turn = another_look(clouds, module.orientation.limited, generator)
+    return module.predict_points(again[:, :count], dense=again), again[:, :count], turn
 
 
 def learn_confidence(
@@ -100,4 +149,6 @@ def learn_confidence(
     clouds: Tensor,  # [n, N, 3] farthest-point order, dense
 ) -> None:
     """Find out how far predictions can be trusted."""
-    module.confidence.learn(*look_twice(module, clouds))
+    plain, stretched = look_again(module, clouds)
+    module.confidence.learn(*plain)
+    module.confidence.learn_strangeness(*stretched)

@@ -1,6 +1,7 @@
-"""What confidence is learnt from: two looks at a cloud and whether their predictions agree."""
+"""What confidence is learnt from: looks at a cloud, stretched or not, and whether their predictions agree."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import roma
@@ -8,7 +9,8 @@ import synthetic_predictions as synthetic
 import torch
 
 from articulate_ssl.geometry.se3 import se3
-from articulate_ssl.training.self_agreement import agree, another_look
+from articulate_ssl.inference.confidence import Confidence
+from articulate_ssl.training.self_agreement import agree, another_look, learn_confidence, look_again, stretches
 
 
 def _seen_again(degrees: float, turn: torch.Tensor) -> tuple:
@@ -40,3 +42,60 @@ def test_another_look_is_part_of_the_cloud_turned(limited):
     assert (angle.max() <= 20.1) if limited else (angle.max() > 60)
     same, _ = another_look(clouds, limited, torch.Generator().manual_seed(1))
     assert torch.equal(again, same)
+
+
+def test_stretches_go_along_the_axes_of_the_base_and_leave_the_size():
+    prediction, points = synthetic.laptop()
+    many = torch.zeros(50, dtype=torch.int64)
+    prediction, points = prediction[many], points[None].expand(50, -1, 3)
+    stretch = stretches(prediction, points, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(stretch, stretch.mT)
+    torch.testing.assert_close((points @ stretch).norm(dim=-1).mean(dim=1), points.norm(dim=-1).mean(dim=1))
+    base = points[0][prediction.part_id[0] == 0]
+    covariance = torch.cov(base.T)
+    torch.testing.assert_close(stretch @ covariance, covariance @ stretch, atol=1e-5, rtol=0)
+    least, *_, most = torch.linalg.eigvalsh(stretch).unbind(dim=1)
+    assert 2 < (most / least).max() <= 4.001 and (most / least).min() < 1.2
+
+
+def _frame(points: torch.Tensor) -> torch.Tensor:  # [B, N, 3] -> [B, 3, 3]
+    """Principal axes, the shortest first, towards where fewer points are."""
+    axes = torch.linalg.eigh(points.mT @ points).eigenvectors
+    axes = axes * ((points @ axes) ** 3).sum(dim=1, keepdim=True).sign()
+    return torch.stack([axes[..., 0], axes[..., 1], torch.linalg.cross(axes[..., 0], axes[..., 1])], dim=-1)
+
+
+class _KnowsBlocks:
+    """Takes the longest direction of a block for its width, as it is in all blocks it knows; halves are its parts."""
+
+    num_points, inference, orientation = 200, SimpleNamespace(points=200), SimpleNamespace(limited=False)
+    size = torch.tensor([0.35, 0.5, 0.75])
+
+    def __init__(self) -> None:
+        self.confidence = Confidence()
+
+    def predict_points(self, points: torch.Tensor, dense: torch.Tensor):
+        frame = _frame(points)
+        own = points @ frame
+        found = synthetic.laptop()[0][torch.zeros(len(points), dtype=torch.int64)]
+        pose = se3(frame, torch.zeros(len(points), 3))
+        error = 0.01 + 0.01 * (own.std(dim=1) / self.size).log().abs().sum(dim=1)
+        return replace(found, base_pose=pose, part_id=(own[..., 2] > 0).long(), reconstruction_error=error)
+
+    def blocks(self, count: int) -> torch.Tensor:
+        points = torch.empty(count, 400, 3).exponential_(generator=torch.Generator().manual_seed(0)) - 1
+        turn = roma.random_rotmat(count)
+        return points * self.size @ turn.mT
+
+
+def test_stretched_clouds_tell_that_what_is_unlike_is_not_known():
+    module = _KnowsBlocks()
+    clouds = module.blocks(96)
+    plain, stretched = look_again(module, clouds)
+    assert plain.agrees.float().mean() > 0.95
+    assert stretched.error.median() > plain.error.median()
+    assert 0.3 < stretched.agrees.float().mean() < 0.95
+    learn_confidence(module, clouds)
+    assert module.confidence.strangeness < -0.05
+    low, high = module.confidence.probability(torch.full((2,), 0.4), torch.tensor([plain.error.median(), 1.0]))
+    assert high < low - 0.3
