@@ -93,8 +93,7 @@ def stretches(
     center = (points * of_base).sum(dim=1, keepdim=True) / of_base.sum(dim=1, keepdim=True).clamp(min=1)
     offset = (points - center) * of_base
     axes = torch.linalg.eigh(offset.mT @ offset).eigenvectors
-    most = math.log(_STRETCH) * torch.rand(len(points), 1, generator=generator)
-    factor = (most * (2 * torch.rand(len(points), 3, generator=generator) - 1)).exp().to(points)
+    factor = _STRETCH ** (2 * torch.rand(len(points), 3, generator=generator) - 1).to(points)
     stretch = axes * factor[:, None] @ axes.mT
     size, stretched_size = (cloud.norm(dim=-1).mean(dim=1) for cloud in (points, points @ stretch))
     return stretch * (size / stretched_size)[:, None, None]
