@@ -25,6 +25,7 @@ from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.inference.pose_estimation import PoseEstimator
 from articulate_ssl.inference.prediction import Prediction, ScanEstimate
 from articulate_ssl.inference.scan_scales import predict_scans
+from articulate_ssl.inference.standing_part import StandingPart
 from articulate_ssl.losses.objective import ObjectiveOptions, rigid_loss
 from articulate_ssl.metrics.report import MULTI_STATE
 from articulate_ssl.network.articulated_network import ArticulatedNetwork
@@ -47,6 +48,7 @@ from articulate_ssl.training.recipes.recipe import Outcome
 from articulate_ssl.training.running_statistics import RadiusStatistics
 from articulate_ssl.training.schedule import ScheduleOptions
 from articulate_ssl.training.self_agreement import LearnConfidence, learn_confidence
+from articulate_ssl.training.standing_lesson import learn_standing_part
 from articulate_ssl.training.set_clouds import SetClouds
 from articulate_ssl.training.test_report import TestReport
 from articulate_ssl.training.turn_lessons import learn_turns, learn_view_turns
@@ -59,7 +61,7 @@ JOINT_TYPES = {"revolute": REVOLUTE, "prismatic": PRISMATIC}
 # first, as what is explained beyond them must not teach, and again when it is known how faces lie: that moves states.
 LESSONS = (
     *("first_limits", "two_ways", "turns", "objects", "handedness", "part_frames", "view_turns", "hinge_sides"),
-    *("joint_limits", "poses", "confidence"),
+    *("joint_limits", "poses", "standing_part", "confidence"),
 )
 # Terms of the loss, by the names that they are logged under.
 _LOGGED = {
@@ -171,6 +173,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         self.pose_network = self.estimator.pose_network
         self.recipe = recipe_type(self.estimator, objective, schedule, discovery)
         self.radius = RadiusStatistics()
+        self.standing_part = StandingPart()
         self.confidence = Confidence()
         self.num_points = 512  # of a training cloud; a scan is thinned to as many
 
@@ -192,8 +195,17 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         refine: bool | None = None,
         dense: Tensor | None = None,  # [B, P, 3] the same clouds with all their points
     ) -> Prediction:
-        """See `PoseEstimator.predict`."""
+        """See `PoseEstimator.predict`; the base is that of the network's own tree, whichever part stands."""
         return self.estimator.predict(points, self.num_points, refine, dense)
+
+    def predict_standing(
+        self,
+        points: Tensor,  # [B, N, 3] normalised, farthest-point order
+        refine: bool | None = None,
+        dense: Tensor | None = None,  # [B, P, 3] the same clouds with all their points
+    ) -> Prediction:
+        """The same, with the part that stands for its base, where that is known (`inference.standing_part`)."""
+        return self.standing_part.stood(self.predict_points(points, refine, dense))
 
     def predict_clouds(
         self,
@@ -203,7 +215,12 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         """Predict scans of unknown scale: see `inference.scan_scales`."""
         radius = float(self.radius.mean), float(self.radius.spread)
         estimates = predict_scans(self.estimator, clouds, self.num_points, radius, refine)
+        estimates = [self._stood(estimate) for estimate in estimates]
         return [self._with_confidence(estimate) for estimate in estimates] if self.confidence.learnt else estimates
+
+    def _stood(self, estimate: ScanEstimate) -> ScanEstimate:
+        rival = None if estimate.rival is None else self.standing_part.stood(estimate.rival)
+        return replace(estimate, prediction=self.standing_part.stood(estimate.prediction), rival=rival)
 
     def _with_confidence(self, estimate: ScanEstimate) -> ScanEstimate:
         probability, unlike = self.confidence_of(estimate.prediction, torch.from_numpy(estimate.points)[None])
@@ -245,6 +262,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             "hinge_sides": (learn_hinge_sides, self.hinge_sides_samples if refines else 0),
             "joint_limits": limits,
             "poses": (learn_poses, self.pose_samples if refines and turns else 0),
+            "standing_part": (learn_standing_part, 0 if any_way else calibration),
             "confidence": (learn_confidence, calibration),
         }
         for lesson in LESSONS:
@@ -375,7 +393,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         if not self.trainer.datamodule.manifest.labelled:
             if self.inference.columns:
                 raise ValueError("inference.columns compares errors, and the set has no labels; leave it out")
-            self.test_report = LabelFreeReport(self.predict_points, self.orientation.limited).to(self.device)
+            self.test_report = LabelFreeReport(self.predict_standing, self.orientation.limited).to(self.device)
             return
         loader = self.trainer.datamodule.calibration_dataloader(self.calibration_samples)
         batches = [self.whole(self.transfer_batch_to_device(batch, self.device, 0)) for batch in loader]
@@ -400,11 +418,11 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
     def predict_batch(self, batch: dict[str, Tensor], refine: bool | None = None) -> Prediction:
         """Predictions of a batch of the data module that is `whole`; no label is read."""
         inputs = split_labels(batch)[0]
-        return self.predict_points(inputs["points"], refine, inputs["dense_points"])
+        return self.predict_standing(inputs["points"], refine, inputs["dense_points"])
 
     def _search(self, batch: dict[str, Tensor]) -> Prediction:
         inputs = split_labels(batch)[0]
-        return self.estimator.search(inputs["points"], inputs["dense_points"])
+        return self.standing_part.stood(self.estimator.search(inputs["points"], inputs["dense_points"]))
 
     def whole(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """The batch with as many points as registration reads; the networks still see those that they would."""
