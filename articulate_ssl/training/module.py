@@ -48,8 +48,8 @@ from articulate_ssl.training.recipes.recipe import Outcome
 from articulate_ssl.training.running_statistics import RadiusStatistics
 from articulate_ssl.training.schedule import ScheduleOptions
 from articulate_ssl.training.self_agreement import LearnConfidence, learn_confidence
-from articulate_ssl.training.standing_lesson import learn_standing_part
 from articulate_ssl.training.set_clouds import SetClouds
+from articulate_ssl.training.standing_lesson import learn_standing_part
 from articulate_ssl.training.test_report import TestReport
 from articulate_ssl.training.turn_lessons import learn_turns, learn_view_turns
 from datamodules.articulated_dataset import split_labels
