@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import networkx as nx
 import torch
 from torch import Tensor
 
@@ -97,10 +98,5 @@ def rerooted(prediction: Prediction, root: int) -> Prediction:
 
 def _turned_round(joints: list[list[int]], root: int) -> list[bool]:
     """Whether each joint (parent, child) lies the wrong way round for a tree that hangs from `root`."""
-    turned, reached = [False] * len(joints), {root}
-    while len(reached) <= len(joints):
-        for j, (parent, child) in enumerate(joints):
-            if (parent in reached) != (child in reached):
-                turned[j] = child in reached
-                reached |= {parent, child}
-    return turned
+    hung = set(nx.bfs_edges(nx.Graph(joints), root))
+    return [(parent, child) not in hung for parent, child in joints]

@@ -27,7 +27,7 @@ def learn_standing_part(
     """Find out which part is to be the base, of clouds of cameras that are held upright."""
     found = []
     for some in announced(log, "which part stands", clouds.split(_BATCH)):
-        prediction = module.estimator.predict(some[:, : registered_points(module)], module.num_points, dense=some)
+        prediction = module.predict_points(some[:, : registered_points(module)], dense=some)
         found.append(prediction.part_pose[..., :3, :3])
     standing = module.standing_part
     spread = standing.learn(torch.cat(found), module.articulated.category.chain().root)

@@ -46,7 +46,7 @@ def test_the_part_that_stands_is_the_base_whichever_the_tree_has(base):
 @pytest.mark.parametrize("base", [0, 1])
 def test_a_door_that_is_as_steady_as_its_body_does_not_take_its_place(base):
     views = _views()
-    opened = roma.rotvec_to_rotmat(torch.rand(len(views), 1) * torch.tensor([0.0, 0.0, 1.5]))
+    opened = roma.rotvec_to_rotmat(torch.linspace(0, 1, len(views))[:, None] * torch.tensor([0.0, 0.0, 1.5]))
     standing = StandingPart()
     standing.learn(torch.stack([views[:, 0], views[:, 0] @ opened], dim=1), base)
     assert standing.learnt and standing.root == base
