@@ -163,7 +163,7 @@ def _rebuild(args: argparse.Namespace) -> int:
 def _teach(args: argparse.Namespace) -> int:
     from articulate_ssl.pretrained.stages import StageFailed
     from articulate_ssl.pretrained.teach import Teaching
-    from articulate_ssl.training.module import LESSONS
+    from articulate_ssl.training.lessons import LESSONS
 
     try:
         for weights in [weights for name in args.names for weights in _named(name)]:

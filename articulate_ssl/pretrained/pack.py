@@ -20,6 +20,7 @@ import yaml
 from articulate_ssl.inference.checkpoint_file import CheckpointError
 from articulate_ssl.metrics.report import JSON_NAME, MULTI_STATE
 from articulate_ssl.training.checkpoint import load_module
+from articulate_ssl.training.lessons import teach
 from articulate_ssl.training.module import ArticulatedPoseModule
 from articulate_ssl.training.set_clouds import SetClouds
 from articulate_ssl.training.shipped_weights import WEIGHTS_FOLDER, ShippedWeights
@@ -193,7 +194,7 @@ def _learn_confidence(module: ArticulatedPoseModule, data: dict[str, Any]) -> No
     if module.confidence.learnt:
         return
     own = {name: data[name] for name in ("category", "root", "source", "view", "num_points")}
-    module.learn_what_predictions_are_worth(SetClouds(ArticulatedDataModule(**own)), ("confidence",))
+    teach(module, SetClouds(ArticulatedDataModule(**own)), ("confidence",))
 
 
 def _refuse_other_options(

@@ -1,9 +1,8 @@
 """What shipped weights learn after their training, taught anew: the lessons that have grown since, and the card.
 
-A training is an hour, and what it leaves stays good while what decides and measures afterwards (`training.module`'s
-`LESSONS`) gets better. So lessons are taught again, by the weights' own training clouds and without labels, or by
-those of more objects; the test objects of the card are tested anew. What is finished stays if it is killed, unless the
-code changes.
+A training is an hour, and what it leaves stays good while what decides and measures afterwards (`training.lessons`)
+gets better. So lessons are taught again, by the weights' own training clouds and without labels, or by those of more
+objects; the test objects of the card are tested anew. What is finished stays if it is killed, unless the code changes.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from articulate_ssl.pretrained.pack import weaknesses
 from articulate_ssl.pretrained.rebuild import commit_of
 from articulate_ssl.pretrained.stages import Stage, Workplace
 from articulate_ssl.training.checkpoint import load_module
-from articulate_ssl.training.module import LESSONS
+from articulate_ssl.training.lessons import LESSONS, teach
 from articulate_ssl.training.set_clouds import SetClouds
 from articulate_ssl.training.shipped_weights import WEIGHTS_FOLDER, ShippedWeights
 from articulate_ssl.training.weights_card import CARD_SUFFIX, WeightsCard
@@ -77,7 +76,7 @@ class Teaching:
         for lesson in (lesson for lesson in LESSONS if lesson in self.lessons and lesson not in done):
             say(f"{self.weights.name}: {lesson} …")
             with shown():
-                module.learn_what_predictions_are_worth(SetClouds(data), (lesson,))
+                teach(module, SetClouds(data), (lesson,))
             write_weights(module, self._taught)
             done.append(lesson)
             with atomic_write(self._note) as file:

@@ -34,35 +34,21 @@ from articulate_ssl.network.rigid_alignment import RigidAlignment
 from articulate_ssl.ops.progress import announced
 from articulate_ssl.ops.ranks import of_all_ranks
 from articulate_ssl.shape.observation import Observation
+from articulate_ssl.training.callbacks.lessons import TeachLessons
 from articulate_ssl.training.columns import TestColumns
-from articulate_ssl.training.explanations import learn_handedness, learn_two_ways
-from articulate_ssl.training.frame_lessons import learn_part_frames
-from articulate_ssl.training.hinge_lessons import learn_hinge_sides
 from articulate_ssl.training.hub import HubWeights
-from articulate_ssl.training.joint_limits import learn_joint_limits
 from articulate_ssl.training.label_free_report import LabelFreeReport
-from articulate_ssl.training.object_lessons import learn_objects
-from articulate_ssl.training.pose_lessons import learn_poses
 from articulate_ssl.training.recipes import recipe_class
 from articulate_ssl.training.recipes.recipe import Outcome
 from articulate_ssl.training.running_statistics import RadiusStatistics
 from articulate_ssl.training.schedule import ScheduleOptions
-from articulate_ssl.training.self_agreement import LearnConfidence, learn_confidence
 from articulate_ssl.training.set_clouds import SetClouds
-from articulate_ssl.training.standing_lesson import learn_standing_part
 from articulate_ssl.training.test_report import TestReport
-from articulate_ssl.training.turn_lessons import learn_turns, learn_view_turns
 from datamodules.articulated_dataset import split_labels
 
 log = logging.getLogger(__name__)
 
 JOINT_TYPES = {"revolute": REVOLUTE, "prismatic": PRISMATIC}
-# What is learnt after the last step, in this order: each reads what those before it have learnt. Joint limits come
-# first, as what is explained beyond them must not teach, and again when it is known how faces lie: that moves states.
-LESSONS = (
-    *("first_limits", "two_ways", "turns", "objects", "handedness", "part_frames", "view_turns", "hinge_sides"),
-    *("joint_limits", "poses", "standing_part", "confidence"),
-)
 # Terms of the loss, by the names that they are logged under.
 _LOGGED = {
     "loss": "loss",
@@ -235,49 +221,11 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         error = relative_error(prediction, points.to(prediction.margin))
         return self.confidence.probability(prediction.margin, error), self.confidence.unlike(error)
 
-    def learn_what_predictions_are_worth(self, training_clouds: SetClouds, lessons: Sequence[str] = LESSONS) -> None:
-        """Learn from training clouds what decides and measures in the end, and how far predictions can be trusted.
-
-        Args:
-            training_clouds: Of which a fixed subset teaches each lesson.
-            lessons: Which of `LESSONS`, each on top of what was learnt before; what does not apply teaches nothing.
-        """
-        training = self.training
-        self.eval()
-        turns, refines = self.articulated.joint_type == REVOLUTE, bool(self.inference.refine)
-        views = self.view_search.learnt
-        any_way = not self.orientation.limited
-        # Where the frames of the collection have said which way round clouds are, nothing is left to decide.
-        decides = refines and any_way and not self.sliding.learnt
-        calibration = self.calibration_samples
-        limits = learn_joint_limits, calibration if refines and turns else 0
-        plan = {
-            "first_limits": limits,
-            "two_ways": (learn_two_ways, self.two_ways_samples if decides else 0),
-            "turns": (learn_turns, self.two_ways_samples if refines and any_way and self.sliding.learnt else 0),
-            "objects": (learn_objects, self.object_samples if refines and len(self.sliding.labelled) else 0),
-            "handedness": (learn_handedness, 0 if any_way else self.handedness_samples),
-            "part_frames": (learn_part_frames, self.part_frames_samples if refines and (turns or views) else 0),
-            "view_turns": (learn_view_turns, self.two_ways_samples if refines and views else 0),
-            "hinge_sides": (learn_hinge_sides, self.hinge_sides_samples if refines else 0),
-            "joint_limits": limits,
-            "poses": (learn_poses, self.pose_samples if refines and turns else 0),
-            "standing_part": (learn_standing_part, 0 if any_way else calibration),
-            "confidence": (learn_confidence, calibration),
-        }
-        for lesson in LESSONS:
-            learn, samples = plan[lesson]
-            if lesson in lessons and samples:
-                whole = lesson == "objects"
-                shown = training_clouds.objects(samples) if whole else (training_clouds.clouds(samples),)
-                learn(self, *(some.to(self.device) for some in shown))
-        self.train(training)
-
     # Training
 
     def configure_callbacks(self) -> list[Callback]:
-        """Confidence is learnt with the last step."""
-        return [LearnConfidence()]
+        """Lessons belong to the last step."""
+        return [TeachLessons()]
 
     def configure_optimizers(self) -> dict[str, Any]:
         """Adam; the category's shapes and joints are a group of their own."""

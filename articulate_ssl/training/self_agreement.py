@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import roma
 import torch
-from lightning.pytorch import Callback
 from torch import Tensor
 
 from articulate_ssl.geometry.se3 import se3, transform_points
@@ -21,7 +20,6 @@ from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.metrics.functional import ABOVE_DEG
 from articulate_ssl.ops.farthest_point import farthest_point_order
 from articulate_ssl.ops.progress import announced, tell
-from articulate_ssl.training.set_clouds import SetClouds
 
 if TYPE_CHECKING:
     from articulate_ssl.training.module import ArticulatedPoseModule
@@ -34,15 +32,6 @@ _STRETCH = 2.0  # at most, either way, along each axis. Chosen.
 _BATCH = 16
 
 log = logging.getLogger(__name__)
-
-
-class LearnConfidence(Callback):
-    """Let a module learn its confidence after its last step, before that step's checkpoint is written."""
-
-    def on_train_batch_end(self, trainer, pl_module: ArticulatedPoseModule, *_) -> None:
-        """At the last step only."""
-        if trainer.global_step == trainer.max_steps and pl_module.calibration_samples:
-            pl_module.learn_what_predictions_are_worth(SetClouds(trainer.datamodule))
 
 
 def another_look(

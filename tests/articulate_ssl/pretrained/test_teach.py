@@ -8,10 +8,10 @@ from packable import made_up_metrics, shipped_in, trained
 from synthetic import write_synthetic_set
 
 from articulate_ssl.inference.checkpoint_file import CheckpointError
-from articulate_ssl.pretrained import stages
+from articulate_ssl.pretrained import stages, teach
 from articulate_ssl.pretrained.teach import Teaching
 from articulate_ssl.training.checkpoint import load_module
-from articulate_ssl.training.module import LESSONS, ArticulatedPoseModule
+from articulate_ssl.training.lessons import LESSONS
 from articulate_ssl.training.weights_card import WeightsCard
 from articulate_ssl.training.weights_file import write_weights
 
@@ -43,15 +43,15 @@ def made(monkeypatch):
 def learnt(monkeypatch):
     """Lessons that were taught."""
     lessons = []
-    teach = ArticulatedPoseModule.learn_what_predictions_are_worth
+    plain = teach.teach
 
-    def noted(self, clouds, some):
+    def noted(module, clouds, some):
         lessons.extend(some)
         if "interrupt" in lessons:
             raise KeyboardInterrupt
-        teach(self, clouds, some)
+        plain(module, clouds, some)
 
-    monkeypatch.setattr(ArticulatedPoseModule, "learn_what_predictions_are_worth", noted)
+    monkeypatch.setattr(teach, "teach", noted)
     return lessons
 
 

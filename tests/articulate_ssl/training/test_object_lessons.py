@@ -7,6 +7,7 @@ from tiny import POINTS, tiny_module
 from articulate_ssl.discovery.discover import DiscoveryError
 from articulate_ssl.discovery.similar_clouds import LabelledClouds
 from articulate_ssl.training import part_lessons
+from articulate_ssl.training.lessons import teach
 from articulate_ssl.training.object_lessons import learn_objects
 
 # Nine clouds of object 5, three of object 6, eight of objects 2 and 4.
@@ -86,8 +87,8 @@ def test_whole_objects_are_asked_for_where_discovery_found_some(module, monkeypa
             asked.append(count)
             return _clouds(), INSTANCE
 
-    module.learn_what_predictions_are_worth(Clouds(), ("objects",))
+    teach(module, Clouds(), ("objects",))
     assert not asked
     module.sliding.learn_labelled(LabelledClouds(torch.rand(1, POINTS, 3), torch.zeros(1, POINTS)))
-    module.learn_what_predictions_are_worth(Clouds(), ("objects",))
+    teach(module, Clouds(), ("objects",))
     assert asked == [1200] and len(module.sliding.labelled) == 16

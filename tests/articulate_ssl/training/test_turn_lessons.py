@@ -8,6 +8,7 @@ from tiny import POINTS, tiny_module
 
 from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.training import turn_lessons
+from articulate_ssl.training.lessons import teach
 from articulate_ssl.training.turn_lessons import learn_turns, learn_view_turns
 
 
@@ -52,5 +53,5 @@ def test_nothing_is_learnt_where_no_collection_says_anything(monkeypatch, option
     if options:
         module.sliding.gallery = torch.zeros(3, 8, 3)
     shown = type("Clouds", (), {"clouds": lambda *_: pytest.fail("asked for clouds")})()
-    module.learn_what_predictions_are_worth(shown, ("turns", "view_turns"))
+    teach(module, shown, ("turns", "view_turns"))
     assert module.sliding.surface is None and module.object_frame.surface is None
