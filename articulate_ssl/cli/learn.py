@@ -23,6 +23,7 @@ from articulate_ssl.cli.unsaid import completed, given_option, newest_checkpoint
 from articulate_ssl.discovery.discover import DiscoveryError
 from articulate_ssl.inference.checkpoint_file import CheckpointError, read_checkpoint
 from articulate_ssl.network.options import NetworkOptions
+from articulate_ssl.ops.denormals import flush_denormals
 from articulate_ssl.training.callbacks.duration import EstimateDuration
 from articulate_ssl.training.callbacks.keep_last import KeepLast
 from articulate_ssl.training.callbacks.show_progress import ShowProgress
@@ -143,6 +144,7 @@ class ArticulateCLI(LightningCLI):
         return [*(loggers if isinstance(loggers, list) else [loggers]), wandb]
 
 
+@flush_denormals()
 def run(arguments: list[str]) -> int:
     """Fit, validate or test, as `arguments` say.
 

@@ -1,4 +1,4 @@
-"""`lightning predict CLOUD --category laptop`: from a scan to a folder of results, by the weights of the package.
+"""`articulate-ssl predict CLOUD --category laptop`: from a scan to a folder of results, by the weights of the package.
 
 A thin client of the Python interface (`articulate_ssl.load`): what it prints and writes, a program can have.
 """
@@ -11,22 +11,21 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import torch
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
 from articulate_ssl.cli import BAD_INPUT
 from articulate_ssl.inference.checkpoint_file import CheckpointError
-from articulate_ssl.inference.export.folder import EXPORTERS_BY_NAME, ON_REQUEST, ExportError, exporters_named
-from articulate_ssl.inference.export.physics_check import PhysicsCheckError
-from articulate_ssl.inference.scan_prediction import ScanPrediction
+from articulate_ssl.inference.export.formats import FORMATS, ON_REQUEST, ExportError, chosen_formats
 from articulate_ssl.ops.progress import shown
 from articulate_ssl.training.shipped_weights import shipped_weights
 from articulate_ssl.training.weights_card import VIEWS, WeightsCard
-from datamodules.point_cloud_io import PointCloudError, load_point_cloud
 
 if TYPE_CHECKING:
+    import torch
+
+    from articulate_ssl.inference.scan_prediction import ScanPrediction
     from articulate_ssl.pretrained.estimator import ArticulatedPoseEstimator
 
 AUTO = "auto"
@@ -57,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         + "; auto (default): whichever weights explain the scan better",
     )
     parser.add_argument("--out", type=Path, help="folder for the results (default: <name of the scan>-prediction)")
-    parser.add_argument("--device", type=_device, default="cpu", help="cpu (default), cuda, cuda:1, …")
+    parser.add_argument("--device", default="cpu", help="cpu (default), cuda, cuda:1, …")
     parser.add_argument(
         "--refine",
         action=argparse.BooleanOptionalAction,
@@ -67,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--formats",
         type=_formats,
-        help=f"what to write, with commas between: {', '.join(EXPORTERS_BY_NAME)} (default: all that can be written "
+        help=f"what to write, with commas between: {', '.join(FORMATS)} (default: all that can be written "
         f"but {', '.join(ON_REQUEST)}, which takes seconds)",
     )
     parser.add_argument("--html", action="store_true", help="also write a page to look at and move it in a browser")
@@ -92,15 +91,24 @@ def run(arguments: list[str]) -> int:
         SystemExit: of code 2 for bad arguments, with the usage on stderr; of code 0 for --help.
     """
     parser = argparse.ArgumentParser(
-        prog="lightning predict", description="Parts, poses and joints of the object in one scan."
+        prog="articulate-ssl predict", description="Parts, poses and joints of the object in one scan."
     )
     add_arguments(parser)
     args = parser.parse_args(arguments[1:])
     if args.ckpt and args.view != AUTO:
         parser.error("--view chooses among the weights of the package: give it with --category, or leave it out")
     out = args.out or Path(f"{args.cloud.stem}-prediction")
+    from articulate_ssl.inference.export.physics_check import PhysicsCheckError
+    from articulate_ssl.ops.denormals import flush_denormals
+    from datamodules.point_cloud_io import PointCloudError
+
     try:
-        candidates, chosen = _predict(args)
+        device = _device(args.device)
+    except ValueError as error:
+        parser.error(f"--device {error}")
+    try:
+        with flush_denormals():
+            candidates, chosen = _predict(args, device)
         files = _write(candidates[0], out, args)
         _print_summary(candidates, files, chosen)
         if args.check:
@@ -111,14 +119,14 @@ def run(arguments: list[str]) -> int:
     return 0
 
 
-def _predict(args: argparse.Namespace) -> tuple[list[ScanPrediction], ArticulatedPoseEstimator]:
+def _predict(args: argparse.Namespace, device: torch.device) -> tuple[list[ScanPrediction], ArticulatedPoseEstimator]:
     """What every set of weights that is asked says, best first, and the best one's estimator."""
-    # Imported here: the network takes long to import, and --help needs none of it.
     from articulate_ssl.pretrained.estimator import load
     from articulate_ssl.pretrained.ranking import ranked
+    from datamodules.point_cloud_io import load_point_cloud
 
     cloud = load_point_cloud(args.cloud)
-    estimator = load(args.category or args.ckpt, None if args.view == AUTO else args.view, args.device)
+    estimator = load(args.category or args.ckpt, None if args.view == AUTO else args.view, device)
     several = len(estimator.estimators) > 1
     progress = track(
         estimator.estimators, "trying weights", console=Console(stderr=True), disable=not several, transient=True
@@ -194,21 +202,22 @@ def _print_choice(candidates: list[ScanPrediction], console: Console) -> None:
 def _formats(text: str) -> list[str]:
     names = [name.strip() for name in text.split(",") if name.strip()]
     try:
-        exporters_named(names)
+        chosen_formats(names)
     except ExportError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
     return names
 
 
 def _device(name: str) -> torch.device:
+    """Raises: ValueError if there is no such device."""
+    import torch
+
     try:
         device = torch.device(name)
     except RuntimeError as error:
-        raise argparse.ArgumentTypeError(f"{name!r} is no device; use cpu, cuda or cuda:<index>") from error
+        raise ValueError(f"{name!r} is no device; use cpu, cuda or cuda:<index>") from error
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        raise argparse.ArgumentTypeError(
-            f"{name!r}: this machine has {torch.cuda.device_count()} CUDA devices; use cpu"
-        )
+        raise ValueError(f"{name!r}: this machine has {torch.cuda.device_count()} CUDA devices; use cpu")
     return device
 
 

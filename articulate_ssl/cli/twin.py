@@ -11,7 +11,6 @@ from rich.console import Console
 from rich.table import Table
 
 from articulate_ssl.cli import BAD_INPUT
-from datamodules.point_cloud_io import PointCloudError, load_point_cloud
 
 DEFAULT_FOLDER = Path("twin")
 
@@ -51,13 +50,15 @@ def run(arguments: list[str]) -> int:
     args = parser.parse_args(arguments[1:])
     if args.parts < 2:
         parser.error(f"--parts {args.parts}: an object that moves has at least two parts, its base included")
-    # Imported here: both take long, and --help needs neither.
     from articulate_ssl.discovery.discover import DiscoveryError
-    from articulate_ssl.inference.export.folder import ExportError
+    from articulate_ssl.inference.export.formats import ExportError
     from articulate_ssl.inference.export.physics_check import PhysicsCheckError
+    from articulate_ssl.ops.denormals import flush_denormals
+    from datamodules.point_cloud_io import PointCloudError
 
     try:
-        _twin(args)
+        with flush_denormals():
+            _twin(args)
     except (PointCloudError, DiscoveryError, ExportError, PhysicsCheckError, OSError) as error:
         print(f"articulate-ssl twin: {error}", file=sys.stderr)
         return BAD_INPUT
@@ -67,6 +68,7 @@ def run(arguments: list[str]) -> int:
 def _twin(args: argparse.Namespace) -> None:
     from articulate_ssl.inference.twin import find_twin
     from articulate_ssl.ops.progress import shown
+    from datamodules.point_cloud_io import load_point_cloud
 
     clouds = [load_point_cloud(path) for path in args.scans]
     with shown():

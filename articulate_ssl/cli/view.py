@@ -38,7 +38,6 @@ def run(arguments: list[str]) -> int:
     )
     add_arguments(parser)
     args = parser.parse_args(arguments[1:])
-    # Imported here: viser and torch take long to import, and --help needs neither.
     with Console(stderr=True).status("opening the prediction"):
         from articulate_ssl.inference.export.arrays import ResultFolderError, load_scan_prediction
         from articulate_ssl.inference.viewer.live import LiveViewer

@@ -40,10 +40,17 @@ def run(arguments: list[str]) -> int:
     """
     args = _parser().parse_args(arguments[1:])
     try:
-        return args.do(args)
+        return args.do(args) if args.do in (_list, _show) else _computed(args)
     except (CheckpointError, ManifestError, OSError) as error:
         print(f"articulate-ssl weights: {error}", file=sys.stderr)
         return BAD_INPUT
+
+
+def _computed(args: argparse.Namespace) -> int:
+    from articulate_ssl.ops.denormals import flush_denormals
+
+    with flush_denormals():
+        return args.do(args)
 
 
 def _parser() -> argparse.ArgumentParser:

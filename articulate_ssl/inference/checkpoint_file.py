@@ -9,8 +9,6 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-import torch
-
 CHECKPOINT_KEY = "articulate_ssl"
 SUFFIX = ".ckpt"
 
@@ -28,6 +26,8 @@ def read_checkpoint(path: str | os.PathLike) -> dict[str, Any]:
     Raises:
         CheckpointError: naming the file, what is wrong with it and what to do.
     """
+    import torch  # here, because it takes seconds, and the error alone is needed where no checkpoint is read
+
     path = Path(path)
     _check_file(path)
     try:

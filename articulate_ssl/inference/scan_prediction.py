@@ -181,7 +181,7 @@ class ScanPrediction:
 
         Args:
             folder: Where to; files of the same names are replaced.
-            formats: Of `inference.export.folder.EXPORTERS_BY_NAME`; None writes all that this machine can
+            formats: Of `inference.export.formats.FORMATS`; None writes all that this machine can
                 but `gif`, which takes seconds.
 
         Raises:

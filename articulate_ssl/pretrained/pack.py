@@ -24,8 +24,8 @@ from articulate_ssl.training.lessons import teach
 from articulate_ssl.training.module import ArticulatedPoseModule
 from articulate_ssl.training.set_clouds import SetClouds
 from articulate_ssl.training.shipped_weights import WEIGHTS_FOLDER, ShippedWeights
-from articulate_ssl.training.weights_card import CARD_SUFFIX, HEADLINES, WeightsCard
-from articulate_ssl.training.weights_file import SUFFIX, write_weights
+from articulate_ssl.training.weights_card import CARD_SUFFIX, HEADLINES, SUFFIX, WeightsCard
+from articulate_ssl.training.weights_file import write_weights
 from datamodules.articulated_data_module import ArticulatedDataModule
 from datamodules.manifest import Manifest, set_folder
 

@@ -20,8 +20,7 @@ from articulate_ssl.inference.checkpoint_file import CheckpointError
 from articulate_ssl.pretrained.pack import VIEW_OF_DATA, fit_command, newest_metrics, pack
 from articulate_ssl.pretrained.stages import Stage, StageFailed, Workplace
 from articulate_ssl.training.shipped_weights import WEIGHTS_FOLDER
-from articulate_ssl.training.weights_card import CARD_SUFFIX
-from articulate_ssl.training.weights_file import SUFFIX
+from articulate_ssl.training.weights_card import CARD_SUFFIX, SUFFIX
 from datamodules.manifest import set_folder
 
 CATEGORIES = ("laptop", "oven", "eyeglasses", "washing_machine", "safe", "drawer", "desk_lamp", "laptop_real")

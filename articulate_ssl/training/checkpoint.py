@@ -13,7 +13,8 @@ from articulate_ssl.losses.objective import ObjectiveOptions
 from articulate_ssl.network.options import NetworkOptions
 from articulate_ssl.training.module import ArticulatedPoseModule
 from articulate_ssl.training.schedule import ScheduleOptions
-from articulate_ssl.training.weights_file import SUFFIX, read_weights
+from articulate_ssl.training.weights_card import SUFFIX
+from articulate_ssl.training.weights_file import read_weights
 
 _GROUPS = {
     "network": NetworkOptions,

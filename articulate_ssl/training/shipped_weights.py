@@ -11,12 +11,8 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
-from huggingface_hub import hf_hub_download
-from huggingface_hub.errors import EntryNotFoundError, HFValidationError
-
 from articulate_ssl.inference.checkpoint_file import CheckpointError
-from articulate_ssl.training.weights_card import VIEWS
-from articulate_ssl.training.weights_file import SUFFIX
+from articulate_ssl.training.weights_card import SUFFIX, VIEWS
 
 WEIGHTS_FOLDER = Path(__file__).parent.parent / "pretrained" / "weights"
 MODEL_FILE = f"model{SUFFIX}"  # in a folder of its own, or on the hub
@@ -88,6 +84,10 @@ def find_weights(
         return path  # who reads it says what is wrong with it
     if path.is_absolute() or len(path.parts) != 2:
         raise CheckpointError(f"{name_or_path}: neither a file nor weights of the package; those are {_shipped_list()}")
+    # Imported here: who asks for weights of the package needs none of it.
+    from huggingface_hub import hf_hub_download
+    from huggingface_hub.errors import EntryNotFoundError, HFValidationError
+
     hub = {"revision": revision, "token": token, "cache_dir": cache_dir}
     hub |= {"local_files_only": local_files_only, "force_download": force_download}
     try:

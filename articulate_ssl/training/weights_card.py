@@ -11,7 +11,8 @@ from typing import Any
 from articulate_ssl.inference.checkpoint_file import CheckpointError
 from datamodules.atomic import atomic_write
 
-CARD_SUFFIX = ".json"
+SUFFIX = ".safetensors"  # of weights
+CARD_SUFFIX = ".json"  # of the card beside them
 # How clouds were taken, by the word for it in names of weights.
 VIEWS = {
     "complete": "complete clouds in any orientation",

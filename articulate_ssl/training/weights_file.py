@@ -26,7 +26,6 @@ from datamodules.atomic import atomic_write
 if TYPE_CHECKING:
     from articulate_ssl.training.module import ArticulatedPoseModule
 
-SUFFIX = ".safetensors"
 _GEOMETRY = "articulated.category."  # parameters that are lengths and directions themselves
 
 

@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import huggingface_hub
 import pytest
 import roma
 import torch
@@ -61,7 +62,7 @@ def no_network(monkeypatch):
     def refuse(*_args, **_kwargs):
         raise LocalEntryNotFoundError("cannot reach the hub")
 
-    monkeypatch.setattr(shipped_weights, "hf_hub_download", refuse)
+    monkeypatch.setattr(huggingface_hub, "hf_hub_download", refuse)
 
 
 def test_half_precision_predicts_what_the_checkpoint_predicts(trained, tmp_path):
@@ -150,7 +151,7 @@ def test_without_a_network_a_hub_name_gets_a_clear_word(package, no_network):
 
 
 def test_other_names_are_not_looked_up_on_the_hub(package, monkeypatch):
-    monkeypatch.setattr(shipped_weights, "hf_hub_download", lambda *_, **__: pytest.fail("asked the hub"))
+    monkeypatch.setattr(huggingface_hub, "hf_hub_download", lambda *_, **__: pytest.fail("asked the hub"))
     with pytest.raises(CheckpointError, match=r"toaster: neither a file nor .*laptop-complete"):
         ArticulatedPoseModule.from_pretrained("toaster")
     with pytest.raises(CheckpointError, match=r"some/missing\.ckpt: no such checkpoint"):
@@ -164,7 +165,7 @@ def test_a_hub_name_is_downloaded_with_its_options(package, monkeypatch):
         asked.update(options, repository=repository, file=file)
         return str(package / "laptop-complete.safetensors")
 
-    monkeypatch.setattr(shipped_weights, "hf_hub_download", download)
+    monkeypatch.setattr(huggingface_hub, "hf_hub_download", download)
     assert ArticulatedPoseModule.from_pretrained("somebody/oven", revision="v2").category == "laptop"
     assert (asked["repository"], asked["file"], asked["revision"]) == ("somebody/oven", "model.safetensors", "v2")
 

@@ -2,16 +2,9 @@ import pytest
 import synthetic_predictions as synthetic
 from scan_predictions import OBJECTS, result_of
 
-from articulate_ssl.inference.export import folder as export_folder
-from articulate_ssl.inference.export import picture, prediction_json, rigid_links
-from articulate_ssl.inference.export.folder import (
-    EXPORTERS,
-    EXPORTERS_BY_NAME,
-    ON_REQUEST,
-    ExportError,
-    exporters_named,
-    write_prediction,
-)
+from articulate_ssl.inference.export import formats, picture, prediction_json, rigid_links
+from articulate_ssl.inference.export.folder import EXPORTERS, EXPORTERS_BY_NAME, exporters_named, write_prediction
+from articulate_ssl.inference.export.formats import FORMATS, ON_REQUEST, ExportError
 
 
 @pytest.fixture(autouse=True)
@@ -71,6 +64,7 @@ def test_a_failure_half_way_leaves_the_earlier_results(tmp_path, monkeypatch):
 
 
 def test_exporters_are_found_by_name_and_the_json_stays_last():
+    assert tuple(EXPORTERS_BY_NAME) == FORMATS and FORMATS[-1] == "json"
     found = exporters_named(["json", "glb", "urdf", "glb"])
     assert found == tuple(EXPORTERS_BY_NAME[name] for name in ("urdf", "glb", "json"))
     usual = [name for name in EXPORTERS_BY_NAME if name not in ON_REQUEST]
@@ -95,7 +89,7 @@ def test_an_unknown_name_is_refused_with_the_known_ones():
 
 
 def test_a_format_whose_package_is_missing_is_left_out_and_refused_where_asked_for(monkeypatch):
-    monkeypatch.setattr(export_folder, "find_spec", lambda package: None)
+    monkeypatch.setattr(formats, "find_spec", lambda package: None)
     assert EXPORTERS_BY_NAME["usd"] not in exporters_named(None)
     assert len(exporters_named(None)) == len(EXPORTERS) - 1
     with pytest.raises(ExportError, match=r"usd needs .*pxr.* pip install 'articulate-ssl\[usd\]'"):
