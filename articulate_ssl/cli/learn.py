@@ -9,14 +9,16 @@ import signal
 import sys
 import warnings
 from dataclasses import asdict
+from inspect import signature
 from pathlib import Path
+from typing import Any
 
 import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.cli import LightningCLI
 from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
-from lightning.pytorch.utilities.exceptions import SIGTERMException
+from lightning.pytorch.utilities.exceptions import MisconfigurationException, SIGTERMException
 
 from articulate_ssl.cli import BAD_INPUT
 from articulate_ssl.cli.unsaid import completed, given_option, newest_checkpoint
@@ -28,7 +30,7 @@ from articulate_ssl.training.callbacks.duration import EstimateDuration
 from articulate_ssl.training.callbacks.keep_last import KeepLast
 from articulate_ssl.training.callbacks.show_progress import ShowProgress
 from articulate_ssl.training.callbacks.test_results import SendTestResults
-from articulate_ssl.training.module import ArticulatedPoseModule
+from articulate_ssl.training.module import JOINT_TYPES, ArticulatedPoseModule
 from datamodules.articulated_data_module import ArticulatedDataModule
 
 IGNORED_WARNINGS = (
@@ -42,6 +44,11 @@ IGNORED_WARNINGS = (
 WANDB_PROJECT = "articulate-ssl"  # where --wandb names none
 TERMINATED = 128 + signal.SIGTERM  # the exit code, as a shell has it
 _CHECKPOINT_STEPS = 200  # between checkpoints
+# Options of the model without which weights do not fit, or mean something else, and their defaults.
+_OF_WEIGHTS = {
+    name: signature(ArticulatedPoseModule).parameters[name].default
+    for name in ("num_parts", "joint_type", "state_range", "recipe", "orientation_range")
+}
 
 
 class ArticulateCLI(LightningCLI):
@@ -77,10 +84,12 @@ class ArticulateCLI(LightningCLI):
         path = self.config_init["fit"].get("ckpt_path")
         if path is not None:
             self._check_checkpoint("fit", path)
+        self._check_parts("fit")
 
     def before_test(self) -> None:
         """Only trained weights are scored."""
         self._use_checkpoint("test")
+        self._check_parts("test")
 
     def before_validate(self) -> None:
         """Only trained weights are scored."""
@@ -113,19 +122,34 @@ class ArticulateCLI(LightningCLI):
                 f"give `lightning {subcommand}` the same -c files and --model.network options as `lightning fit` "
                 "(with configs/profiles/paper.yaml if that had a GPU and this machine has none)"
             )
-        degrees = remembered.get("orientation_range", 180.0)
-        if degrees != self.model.orientation.degrees:
-            raise CheckpointError(
-                f"{path}: trained with --model.orientation_range {degrees:g}, not "
-                f"{self.model.orientation.degrees:g}; give `lightning {subcommand}` the same -c files as "
-                "`lightning fit` (configs/profiles/depth_camera.yaml sets it)"
-            )
         trained_on = remembered.get("category")
         if trained_on != self.model.category:
             raise CheckpointError(
                 f"{path}: trained on category {trained_on!r}, but the data are {self.model.category!r}; "
                 f"use configs/{trained_on}.yaml or another checkpoint"
             )
+        other = _other_model(remembered, self.model.hparams)
+        if other is not None:
+            name, theirs, ours = other
+            raise CheckpointError(
+                f"{path}: trained with --model.{name} {theirs}, not {ours}; give `lightning {subcommand}` the same -c "
+                "files and options as `lightning fit` (of profiles, depth_camera.yaml sets orientation_range, "
+                "paper_recipe.yaml recipe and rigid_steps)"
+            )
+
+    def _check_parts(self, subcommand: str) -> None:
+        """Parts and joints of the model and of the labels: without labels, any number can be looked for."""
+        manifest, model = self.datamodule.manifest, self.model.hparams
+        problem = None
+        if len(manifest.part_names) != model["num_parts"]:
+            problem = f"{len(manifest.part_names)} parts, and --model.num_parts is {model['num_parts']}"
+        elif JOINT_TYPES[model["joint_type"]] not in manifest.joint_types:
+            problem = f"no {model['joint_type']} joint, as --model.joint_type says"
+        if problem is not None and manifest.labelled:
+            said = f"{self.datamodule.folder}: labels have {problem}"
+            if subcommand == "test":
+                raise CheckpointError(f"{said}; nothing can be scored: leave -c out, or name the set it was trained on")
+            print(f"lightning {subcommand}: {said}: `lightning test` will refuse to score that", file=sys.stderr)
 
     def _loggers(self) -> list[Logger]:
         """The first decides about the run's folder, as without the flag."""
@@ -169,8 +193,13 @@ def run(arguments: list[str]) -> int:
             trainer_defaults={"callbacks": _callbacks()},
             save_config_kwargs={"overwrite": True},
         )
-    except (ValueError, DiscoveryError) as error:
+    except (ValueError, DiscoveryError, MisconfigurationException) as error:
         print(f"lightning: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except OSError as error:
+        if error.errno is None:
+            raise
+        print(f"lightning: {error} (runs are written to --trainer.default_root_dir)", file=sys.stderr)
         return BAD_INPUT
     except SIGTERMException:  # a SystemExit without a code: whoever waits for the end would take it for success
         print(f"lightning {arguments[0]}: terminated", file=sys.stderr)
@@ -182,6 +211,17 @@ def run(arguments: list[str]) -> int:
         print(f"lightning: Weights & Biases: {error} (without an account: WANDB_MODE=offline)", file=sys.stderr)
         return BAD_INPUT
     return 0
+
+
+def _other_model(remembered: dict[str, Any], now: dict[str, Any]) -> tuple[str, Any, Any] | None:
+    """An option that weights depend on, of a checkpoint and of the model: the first that differs."""
+    for name, default in _OF_WEIGHTS.items():
+        # An option that a checkpoint has never heard of had its default value.
+        theirs, ours = remembered.get(name, default), now[name]
+        if theirs != ours:
+            return name, theirs, ours
+    theirs, ours = ((some.get("schedule") or {}).get("rigid_steps", 0) for some in (remembered, now))
+    return ("schedule.rigid_steps", theirs, ours) if bool(theirs) != bool(ours) else None
 
 
 def _read_given_checkpoint(arguments: list[str]) -> None:

@@ -105,19 +105,29 @@ def _configs(words: list[str]) -> list[tuple[str, int]]:
             found.append((word.partition("=")[2], i))
         elif word in ("-c", "--config") and i + 1 < len(words):
             found.append((words[i + 1], i + 1))
+        elif word.startswith("-c") and word != "-c":  # as one word, `-c=FILE` or `-cFILE`
+            found.append((word[2:].removeprefix("="), i))
     return found
 
 
 def _accelerator_named(words: list[str]) -> bool:
-    files = (_content(Path(path)).get("trainer") for path, _ in _configs(words))
-    named = any(isinstance(trainer, dict) and "accelerator" in trainer for trainer in files)
+    trainers = [_content(Path(path)).get("trainer") for path, _ in _configs(words)]
+    named = any(isinstance(trainer, dict) and "accelerator" in trainer for trainer in trainers)
     return named or given_option(words, "--trainer.accelerator") is not None
 
 
 def _content(path: Path) -> dict[str, Any]:
-    """Of a configuration file; nothing where it cannot be read, which the parser will refuse with better words."""
+    """Of a configuration file; nothing where there is no file, which the parser will refuse with better words.
+
+    Raises:
+        ValueError: if it holds no options: the parser would not say which of several files it is.
+    """
     try:
         content = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+    except OSError:
         return {}
-    return content if isinstance(content, dict) else {}
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ValueError(f"{path}: not YAML ({' '.join(str(error).split())}); mend it, or name another file") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path}: no configuration, which has lines as `data:` and `model:`; name another file")
+    return content

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from articulate_ssl.ops.options import require_at_least
+
 
 @dataclass(frozen=True)
 class NetworkOptions:
@@ -52,3 +54,10 @@ class NetworkOptions:
     part_features: bool = True
     shared_axis: bool = True
     state_anchors: int | None = None
+
+    def __post_init__(self) -> None:
+        """Raises: ValueError for sizes of which there is no network."""
+        counts = ("dims", "num_neighbors", "num_kernel_points", "head_dim", "shape_points", "iterations")
+        require_at_least(self, "network.", **dict.fromkeys(counts, 1))
+        if not all(radius > 0 for radius in self.radii):
+            raise ValueError(f"network.radii are {self.radii}, must be larger than 0")

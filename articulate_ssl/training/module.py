@@ -31,6 +31,7 @@ from articulate_ssl.metrics.report import MULTI_STATE
 from articulate_ssl.network.articulated_network import ArticulatedNetwork
 from articulate_ssl.network.options import NetworkOptions
 from articulate_ssl.network.rigid_alignment import RigidAlignment
+from articulate_ssl.ops.options import require_at_least
 from articulate_ssl.ops.progress import announced
 from articulate_ssl.ops.ranks import of_all_ranks
 from articulate_ssl.shape.observation import Observation
@@ -100,8 +101,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             any orientation, less where a camera is held upright.
 
     Raises:
-        ValueError: for an unknown recipe, joint type or proposal, or if rigid alignment, which is for any orientation,
-            is asked for within a range.
+        ValueError: for an unknown recipe, joint type or proposal, for numbers that make no sense, or if rigid
+            alignment, which is for any orientation, is asked for within a range.
     """
 
     def __init__(
@@ -128,7 +129,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         super().__init__()
         options = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
         observation = Observation(OrientationRange(orientation_range), objective.unidirectional)
-        _check(num_parts, joint_type, observation, schedule)
+        _check(num_parts, joint_type, state_range, observation, schedule)
         self.save_hyperparameters({name: _plain(value) for name, value in options.items()}, logger=False)
         recipe_type = recipe_class(recipe)
         if network.state_anchors is None:
@@ -143,6 +144,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         self.handedness_samples = handedness_samples
         self.part_frames_samples, self.hinge_sides_samples = part_frames_samples, hinge_sides_samples
         self.pose_samples = pose_samples
+        require_at_least(self, **{name: 0 for name in options if name.endswith("_samples")})
 
         self.articulated = ArticulatedNetwork(network, num_parts, JOINT_TYPES[joint_type], state_bound=state_range)
         self.rigid = RigidAlignment(network, num_parts * network.shape_points) if schedule.rigid_steps else None
@@ -395,11 +397,15 @@ def _plain(value: Any) -> Any:
     return asdict(value) if is_dataclass(value) else value
 
 
-def _check(num_parts: int, joint_type: str, observation: Observation, schedule: ScheduleOptions) -> None:
+def _check(
+    num_parts: int, joint_type: str, state_range: float, observation: Observation, schedule: ScheduleOptions
+) -> None:
     """Refuse options that make no sense."""
     if joint_type not in JOINT_TYPES:
         raise ValueError(f"joint_type must be one of {sorted(JOINT_TYPES)}, got {joint_type!r}")
     if num_parts < 2:
         raise ValueError(f"num_parts must be at least 2, got {num_parts}")
+    if not state_range > 0:
+        raise ValueError(f"state_range is {state_range}, must be larger than 0")
     if observation.orientation.limited and schedule.rigid_steps:
         raise ValueError("rigid_steps align clouds of any orientation: leave them 0, or orientation_range 180")

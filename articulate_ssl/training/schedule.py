@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from articulate_ssl.ops.options import require_at_least
+
 
 @dataclass(frozen=True)
 class ScheduleOptions:
@@ -39,3 +41,7 @@ class ScheduleOptions:
     agreement_share: float = 0.4
     shared_share: float = 0.5
     category_rate: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Raises: ValueError for lengths and rates that there are not."""
+        require_at_least(self, "schedule.", steps=1, rigid_steps=0, warmup_steps=0, learning_rate=0, decay_every=1)

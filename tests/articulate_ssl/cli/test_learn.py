@@ -131,6 +131,47 @@ def test_another_range_of_orientations_than_in_training_is_refused(run):
     refused(run(*command, "--model.orientation_range=90"), "trained.ckpt", "orientation_range 180")
 
 
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ("--model.num_parts=3", "num_parts 2, not 3"),
+        ("--model.joint_type=prismatic", "joint_type revolute, not prismatic"),
+        ("--model.state_range=0.2", "not 0.2"),
+        ("--model.schedule.rigid_steps=1", "schedule.rigid_steps 0, not 1"),
+        ("--model.recipe=staged", "recipe paper, not staged"),
+    ],
+)
+@pytest.mark.parametrize("command", ["fit", "test"])
+def test_a_checkpoint_of_another_model_is_refused(run, command, option, words):
+    given = (command, "-c", "laptop.yaml", "--ckpt_path", "trained.ckpt", "--model.recipe=paper", option)
+    refused(run(*given), "trained.ckpt", words)
+
+
+def test_parts_that_labels_do_not_have_are_told_in_training_and_refused_in_the_test(run, workplace):
+    root = f"--trainer.default_root_dir={workplace / 'three'}"
+    options = ("-c", "laptop.yaml", "--model.recipe=paper", "--model.num_parts=3", root)
+    code, said = run("fit", *options)
+    assert code == 0 and "labels have 2 parts, and --model.num_parts is 3" in said
+    refused(run("test", *options), "procedural-complete", "labels have 2 parts")
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ("--trainer.accelerator=gpu", "No supported gpu backend"),
+        ("--trainer.enable_checkpointing=false", "enable_checkpointing"),
+        ("--trainer.default_root_dir=laptop.yaml", "laptop.yaml"),
+        ("--model.schedule.decay_every=0", "schedule.decay_every is 0, must be at least 1"),
+        ("--model.network.dims=[]", "network.dims"),
+        ("--model.network.radii=[0,0]", "network.radii"),
+        ("--model.state_range=-1", "state_range"),
+        ("--model.pose_samples=-1", "pose_samples is -1, must be at least 0"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused_before_it_begins(run, option, words):
+    refused(run("fit", "-c", "laptop.yaml", "--model.recipe=paper", option), words)
+
+
 def test_a_range_of_orientations_is_remembered_and_told(run, workplace, capsys):
     command = ("fit", "-c", "laptop.yaml", "--model.recipe=paper", "--model.orientation_range=90")
     assert run(*command, f"--trainer.default_root_dir={workplace / 'upright'}")[0] == 0

@@ -30,7 +30,11 @@ def run(folder, name: str, age: int, checkpoint: str = "last.ckpt"):
     return path.relative_to(folder)
 
 
-@pytest.mark.parametrize("given", [["-c", "oven.yaml"], ["--config", "oven.yaml"], ["--config=oven.yaml"]], ids=str)
+@pytest.mark.parametrize(
+    "given",
+    [["-c", "oven.yaml"], ["--config", "oven.yaml"], ["--config=oven.yaml"], ["-c=oven.yaml"], ["-coven.yaml"]],
+    ids=str,
+)
 @pytest.mark.parametrize("command", ["fit", "validate", "test"])
 def test_the_cpu_profile_goes_between_the_category_and_what_is_typed_behind_it(command, given):
     words, notes = completed([command, *given, "-c", "smoke.yaml", "--data.seed", "3"])
@@ -67,9 +71,7 @@ def test_other_commands_and_questions_for_help_are_left_alone(words):
     assert completed(words) == (words, [])
 
 
-def test_a_file_that_cannot_be_read_is_left_to_the_parser(folder):
-    (folder / "bad.yaml").write_text("a: [")
-    assert completed(["fit", "-c", "bad.yaml"]).words[:3] == ["fit", "-c", "bad.yaml"]
+def test_a_file_that_there_is_not_is_left_to_the_parser():
     assert completed(["fit", "-c", "nowhere.yaml"]).words[:3] == ["fit", "-c", "nowhere.yaml"]
 
 
@@ -111,3 +113,10 @@ def test_the_installed_profile_is_that_of_the_repository():
     profile = CPU_PROFILE.parents[2] / "configs" / "profiles" / "cpu.yaml"
     assert CPU_PROFILE.read_bytes() == profile.read_bytes()
     assert yaml.safe_load(CPU_PROFILE.read_text())["trainer"]["accelerator"] == "cpu"
+
+
+@pytest.mark.parametrize("content", ["", "- a", "data: {", "a:\n\tb: 1", b"\x9e\x00"], ids=repr)
+def test_a_file_that_is_no_configuration_is_named(folder, content):
+    (folder / "mine.yaml").write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(ValueError, match=r"mine\.yaml"):
+        completed(["fit", "-c", "oven.yaml", "-c", "smoke.yaml", "-c", "mine.yaml"])
