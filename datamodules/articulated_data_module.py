@@ -14,7 +14,7 @@ from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
 from datamodules.articulated_dataset import ArticulatedDataset, Batch, clouds_of_objects, evenly, spread_subset
-from datamodules.manifest import MANIFEST_NAME, Manifest, ManifestError, set_folder
+from datamodules.manifest import MANIFEST_NAME, PROTOCOLS, VIEWS, Manifest, ManifestError, set_folder
 from datamodules.samplers import EvaluationSampler, TrainingStream
 
 log = logging.getLogger(__name__)
@@ -61,7 +61,7 @@ class ArticulatedDataModule(LightningDataModule):
         calibration_set: Folder of the set whose training clouds calibrate metrics, if not this set's own: what the
             network was trained on, when it is tested on objects or views from elsewhere.
         scans: Folder of a set of complete clouds of the same category, in which parts are discovered where this set's
-            clouds are depth views (`model.discovery.grouped`).
+            clouds are depth views (`model.discovery.grouped`). It must be there, whether they are or not.
         occupancy: Deliver occupancy samples in training and validation; the set must have them
             (`datamodules.occupancy`).
         verify: Compare every shard with its checksum when a stage begins.
@@ -93,8 +93,12 @@ class ArticulatedDataModule(LightningDataModule):
         verify: bool = True,
     ) -> None:
         super().__init__()
+        if view not in VIEWS:
+            raise ValueError(f"view={view!r}, expected one of {', '.join(VIEWS)}")
         if view == "partial":
-            protocol = protocol or "honest"
+            protocol = protocol or PROTOCOLS[0]
+            if protocol not in PROTOCOLS:
+                raise ValueError(f"protocol={protocol!r}, expected one of {', '.join(PROTOCOLS)}")
         elif protocol is not None:
             raise ValueError(f"protocol={protocol!r} with view={view!r}: only partial views have a protocol")
         for name, value, least in (
@@ -135,10 +139,13 @@ class ArticulatedDataModule(LightningDataModule):
         return manifest
 
     def setup(self, stage: str) -> None:
-        """Open and check the split of a stage: `fit`, `validate` or `test`."""
+        """Open and check the split of a stage: `fit` (with the manifest of `scans`), `validate` or `test`."""
         options = self.hparams
         common = {"folder": self.folder, "num_points": options.num_points, "verify": options.verify}
-        self.__dict__.pop("manifest", None)
+        for cached in ("manifest", "_scans", "_scanned_test_objects"):
+            self.__dict__.pop(cached, None)
+        if stage == "fit" and options.scans is not None:
+            _ = self._scans  # refuses a wrong folder also where no recipe reads it
         if stage in ("fit", "validate"):
             common |= {"noise_std": options.noise_std, "dense": options.dense_in_fit, "seed": options.seed}
             common |= {"rotate": self.manifest.view == "complete", "occupancy": options.occupancy}

@@ -79,6 +79,12 @@ class ArticulatedDataset(Dataset):
             if ("part_id" in shard) != manifest.labelled:
                 has = "no labels" if manifest.labelled else "labels"
                 raise ShardError(f"{Path(folder) / split / entry.name}: shard has {has}, the manifest says otherwise.")
+            if outside := set(shard["instance"].tolist()) - set(range(len(manifest.instances[split]))):
+                raise ShardError(
+                    f"{Path(folder) / split / entry.name}: shard has instance {min(outside)}, but the manifest names "
+                    f"{len(manifest.instances[split])} of the {split} split. Remove {folder} and make the set again "
+                    "with `make data`."
+                )
         self._points = [shard["points"] for shard in shards]
         self._part_id = [shard["part_id"] for shard in shards] if manifest.labelled else None
         sizes = {points.shape[1] for points in self._points}

@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import json
+import math
 import os
+import reprlib
 from dataclasses import asdict, dataclass, field, fields
+from functools import cache
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, get_args, get_origin, get_type_hints
 
 from datamodules.atomic import atomic_write
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 MANIFEST_NAME = "manifest.json"
 SPLITS = ("train", "test")
 VIEWS = ("complete", "partial")
 PROTOCOLS = ("honest", "eap")
 SPLIT_BY = ("instance", "scan")
 # Fields that older versions did not have, and what they mean there.
-_ADDED = {1: {"left_out": {}}, 2: {"labelled": True, "split_by": "instance", "scans": {"train": (), "test": ()}}}
+_ADDED = {
+    1: {"left_out": {}},
+    2: {"labelled": True, "split_by": "instance", "scans": {"train": [], "test": []}},
+    3: {"checksums": {}},
+}
 
 
 class ManifestError(ValueError):
@@ -31,6 +39,10 @@ class ShardEntry:
     name: str
     samples: int
     sha256: str
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a field is of another type."""
+        _check_types(self)
 
 
 @dataclass(frozen=True)
@@ -59,6 +71,8 @@ class Manifest:
         split_by: `instance`: no object is in both splits; `scan`: there is one object, some of whose scans test.
         scans: Where nothing is labelled, the files of each split in the order of its samples, below the root folder;
             each gives `options["rotations"]` samples of a complete test split, else one.
+        checksums: SHA-256 of every file in `scans`, or of every external object as it was read, by path or id. Empty
+            of procedural objects and of sets that were made before version 4.
         schema_version: Version of this file's format.
     """
 
@@ -80,10 +94,12 @@ class Manifest:
     labelled: bool = True
     split_by: str = "instance"
     scans: dict[str, tuple[str, ...]] = field(default_factory=lambda: {split: () for split in SPLITS})
+    checksums: dict[str, str] = field(default_factory=dict)
     schema_version: int = SCHEMA_VERSION
 
     def __post_init__(self) -> None:
-        """Raises ValueError if the fields contradict each other."""
+        """Raises ValueError if a field is of another type, or the fields contradict each other."""
+        _check_types(self)
         if self.view not in VIEWS:
             raise ValueError(f"view is {self.view!r}, expected one of {', '.join(VIEWS)}")
         protocols = PROTOCOLS if self.view == "partial" else (None,)
@@ -180,21 +196,47 @@ class Manifest:
             kind = "missing" if difference & expected else "unknown"
             raise ManifestError(f"{path}: manifest has {kind} fields: {', '.join(sorted(difference))}. {remedy}")
         try:
-            return cls(
-                **content
-                | {
-                    "part_names": tuple(content["part_names"]),
-                    "joint_types": tuple(content["joint_types"]),
-                    "articulation_range": tuple((low, high) for low, high in content["articulation_range"]),
-                    "left_out": {instance: str(reason) for instance, reason in content["left_out"].items()},
-                    "instances": {split: tuple(ids) for split, ids in content["instances"].items()},
-                    "scans": {split: tuple(files) for split, files in content["scans"].items()},
-                    "rest_state": {instance: tuple(state) for instance, state in content["rest_state"].items()},
-                    "shards": {s: tuple(ShardEntry(**entry) for entry in e) for s, e in content["shards"].items()},
-                }
-            )
+            shards = {s: tuple(ShardEntry(**entry) for entry in e) for s, e in content["shards"].items()}
+            as_read = {"options": content["options"], "shards": shards}
+            return cls(**{name: _tuples(value) for name, value in content.items()} | as_read)
         except (ValueError, TypeError, AttributeError) as error:
             raise ManifestError(f"{path}: manifest is damaged: {error}. {remedy}") from error
+
+
+@cache
+def _types(kind: type) -> dict[str, Any]:
+    """Types of a dataclass's fields by name."""
+    return get_type_hints(kind)
+
+
+def _check_types(described: Manifest | ShardEntry) -> None:
+    """Raise ValueError, naming the field, if the value of one is not of its type."""
+    for attribute in fields(described):
+        value = getattr(described, attribute.name)
+        if not _is(value, _types(type(described))[attribute.name]):
+            raise ValueError(f"{attribute.name} is {reprlib.repr(value)}, expected {attribute.type}")
+
+
+def _is(value: Any, kind: Any) -> bool:
+    """Whether a value is of a type, as annotations of the fields above state it; a float must be finite."""
+    inner = get_args(kind)
+    if get_origin(kind) is dict:
+        return isinstance(value, dict) and all(_is(k, inner[0]) and _is(v, inner[1]) for k, v in value.items())
+    if get_origin(kind) is tuple:
+        kinds = inner[:1] * len(value) if inner[-1] is ... and isinstance(value, tuple) else inner
+        return isinstance(value, tuple) and len(value) == len(kinds) and all(map(_is, value, kinds))
+    if get_origin(kind) is UnionType:
+        return any(_is(value, one) for one in inner)
+    if kind is float:
+        return isinstance(value, (int, float)) and math.isfinite(value)
+    return kind is Any or isinstance(value, kind)
+
+
+def _tuples(value: Any) -> Any:
+    """JSON lists back as the tuples they were, at any depth."""
+    if isinstance(value, dict):
+        return {key: _tuples(inner) for key, inner in value.items()}
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 def set_folder(

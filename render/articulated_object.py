@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -112,6 +113,19 @@ class ArticulatedObject:
             for joint, state in zip(self.joints, states, strict=True)
         )
         return replace(self, meshes=meshes, joints=joints)
+
+    def checksum(self) -> str:
+        """SHA-256 of all that clouds are made from: parts, joints and surface.
+
+        In single precision, because the last bits of double precision may differ between machines.
+        """
+        joints = [(j.type, j.parent, j.child, *j.axis, *j.pivot, j.lower, j.upper, j.rest) for j in self.joints]
+        digest = hashlib.sha256(repr(self.part_names).encode())
+        for numbers in (joints, *(mesh.vertices for mesh in self.meshes)):
+            digest.update(np.asarray(numbers, dtype="<f4").tobytes())
+        for mesh in self.meshes:
+            digest.update(mesh.faces.astype("<i8").tobytes())
+        return digest.hexdigest()
 
     def validate(self) -> ArticulatedObject:
         """Return self if sound.

@@ -72,12 +72,24 @@ class ReachableSurface:
         num_points: int,
         rng: np.random.Generator,
     ) -> tuple[np.ndarray, np.ndarray]:  # [num_points, 3] and [num_points]
-        """A complete cloud of the posed instance and its part ids, in farthest-point order."""
+        """A complete cloud of the posed instance and its part ids, in farthest-point order.
+
+        Raises:
+            ValueError: if it is of so few points that some part has none, however often it is drawn.
+        """
         size = min(OVERSAMPLING * num_points, len(self.points))
-        chosen = rng.choice(len(self.points), size, replace=False, shuffle=False)
-        posed = move_parts(self.points[chosen], self.part_id[chosen], motion)
-        order = farthest_point_order(posed, num_points)
-        return posed[order], self.part_id[chosen[order]]
+        for _ in range(_MAX_DRAWS):
+            chosen = rng.choice(len(self.points), size, replace=False, shuffle=False)
+            posed = move_parts(self.points[chosen], self.part_id[chosen], motion)
+            order = farthest_point_order(posed, num_points)
+            part_id = self.part_id[chosen[order]]
+            shown = np.bincount(part_id, minlength=self.instance.num_parts)
+            if shown.all():
+                return posed[order], part_id
+        raise ValueError(
+            f"{self.instance.category} instance {self.instance.name!r}: part "
+            f"{self.instance.part_names[int(shown.argmin())]!r} has none of {num_points} points; pass more --points"
+        )
 
 
 def sample_surface(

@@ -19,6 +19,7 @@ from datamodules.atomic import remove_leftovers
 from datamodules.manifest import MANIFEST_NAME, PROTOCOLS, SPLITS, VIEWS, Manifest, ShardEntry, set_folder
 from datamodules.shards import sha256_of
 from render import scan_set
+from render.arguments import at_least
 from render.category import (
     category_names,
     category_text,
@@ -27,9 +28,10 @@ from render.category import (
     parse_category,
     require_folder_name,
 )
+from render.complete_cloud import POOL_SIZE
 from render.depth_renderer import DepthRenderer, RendererUnavailable
 from render.execution import run_tasks
-from render.journal import JOURNAL_NAME, Journal, described, require_same_options
+from render.journal import JOURNAL_NAME, Journal, contents_of, described, require_same
 from render.object_set import ObjectSet, plan_objects
 from render.occupancy import write_occupancy
 from render.partial_cloud import RENDERERS
@@ -56,7 +58,7 @@ def generate(plan: SetPlan, out: Path, workers: int, scheduler: str | None = Non
     With `occupancy`, training clouds of posed objects get so many occupancy samples each, in files of their own.
 
     Raises:
-        ValueError: if an instance is unsound, or the folder holds a set made with other options.
+        ValueError: if an instance is unsound, or the folder holds a set made with other options or of other files.
         OSError: if the output cannot be written; what is finished stays.
     """
     options = plan.options
@@ -80,7 +82,7 @@ def generate(plan: SetPlan, out: Path, workers: int, scheduler: str | None = Non
 def _complete(folder: Path, plan: SetPlan, workers: int, scheduler: str | None) -> None:
     """Make the shards that the journal does not list as finished, then the manifest."""
     tasks = plan.tasks(folder)
-    journal = Journal(folder / JOURNAL_NAME, plan.options.recorded())
+    journal = Journal(folder / JOURNAL_NAME, described(plan.options.recorded(), plan.contents))
     done = {key: result for key, result in journal.read().items() if _intact(folder, result)}
     missing = [task for task in tasks if (task.split, task.name) not in done]
     for result in with_progress(run_tasks(missing, workers, scheduler), len(missing), _description(plan)):
@@ -112,8 +114,10 @@ def _intact(folder: Path, shard: ShardResult | ShardEntry, split: str | None = N
 def _repair(folder: Path, plan: SetPlan, workers: int, scheduler: str | None) -> None:
     """Make the missing and damaged shards of a finished set again."""
     manifest = Manifest.load(folder)
-    found = {"generator_version": manifest.generator_version, **manifest.options}
-    require_same_options(found, described(plan.options.recorded()), folder)
+    splits = manifest.instances if manifest.labelled else manifest.scans
+    contents = contents_of(splits, manifest.left_out, manifest.checksums)
+    found = {"generator_version": manifest.generator_version, **manifest.options, "contents": contents}
+    require_same(found, described(plan.options.recorded(), plan.contents), folder)
     entries = {(split, shard.name): shard for split in SPLITS for shard in manifest.shards[split]}
     tasks = plan.tasks(folder)
     if {(task.split, task.name) for task in tasks} != set(entries):
@@ -144,31 +148,31 @@ def _parser() -> argparse.ArgumentParser:
     add("--view", default="complete", choices=VIEWS)
     add("--protocol", help=f"of partial views: {' or '.join(PROTOCOLS)}", choices=PROTOCOLS, default=PROTOCOLS[0])
     add("--out", type=Path, default=Path("data"))
-    add("--workers", type=_at_least(1), default=os.cpu_count(), help="processes; 1 works in this process")
+    add("--workers", type=at_least(1), default=os.cpu_count(), help="processes; 1 works in this process")
     add("--scheduler", help="address of a Dask scheduler (tcp://…) to use instead of local processes")
-    add("--seed", type=_at_least(0), default=0)
-    add("--train-instances", type=_at_least(0), help="default: as in the category's specification; of scans 4 in 5")
-    add("--test-instances", type=_at_least(0), help="default: as in the category's specification; of scans 1 in 5")
-    add("--rotations", type=_at_least(1), default=10, help="stored rotations of each complete test cloud")
-    add("--points", type=_at_least(1), default=4096, help="points per cloud")
+    add("--seed", type=at_least(0), default=0)
+    add("--train-instances", type=at_least(0), help="default: as in the category's specification; of scans 4 in 5")
+    add("--test-instances", type=at_least(0), help="default: as in the category's specification; of scans 1 in 5")
+    add("--rotations", type=at_least(1), default=10, help="stored rotations of each complete test cloud")
+    add("--points", type=at_least(1), default=4096, help="points per cloud")
     add("--skip-broken", action="store_true", help="leave out objects or scans that cannot be used")
     # Their defaults are filled in later: whoever gives one where it means nothing is told so.
     group = parser.add_argument_group("posed objects, all sources but clouds", argument_default=argparse.SUPPRESS)
     add = group.add_argument
     add("--variant", help="of the category's procedural designs, as its specification names it: both_sides of safe")
-    add("--states", type=_at_least(1), help="articulation states per instance (default: 100)")
-    add("--views", type=_at_least(1), help="depth views of each articulation state (default: 10)")
+    add("--states", type=at_least(1), help="articulation states per instance (default: 100)")
+    add("--views", type=at_least(1), help="depth views of each articulation state (default: 10)")
     add(
         "--resolution",
-        type=_at_least(16),
+        type=at_least(16),
         help="of depth images, pixels (default: as the category says)",
     )
     add("--renderer", choices=("auto", *RENDERERS), help="of partial views (default: auto, which is egl if it works)")
     add("--noise-std", type=float, help="of depth, in rest-state bounding-box diagonals (default: 0)")
-    add("--occupancy", type=_at_least(0), help="samples inside and outside every training cloud's object (default: 0)")
+    add("--occupancy", type=at_least(0), help="samples inside and outside every training cloud's object (default: 0)")
     group = parser.add_argument_group("your own scans, --source clouds", argument_default=argparse.SUPPRESS)
     add = group.add_argument
-    add("--parts", type=_at_least(2), help="number of parts of a category that has no specification")
+    add("--parts", type=at_least(2), help="number of parts of a category that has no specification")
     add("--joint", choices=("revolute", "prismatic"), help="type of its joints")
     add(
         "--normalise",
@@ -177,15 +181,6 @@ def _parser() -> argparse.ArgumentParser:
         "depth views), or take points exactly as they are",
     )
     return parser
-
-
-def _at_least(smallest: int):
-    def integer(text: str) -> int:
-        if (value := int(text)) < smallest:
-            raise argparse.ArgumentTypeError(f"must be at least {smallest}, not {value}")
-        return value
-
-    return integer
 
 
 def plan_from(arguments: argparse.Namespace) -> SetPlan:
@@ -216,6 +211,8 @@ def _object_options(arguments: argparse.Namespace) -> SetOptions:
     spec = load_category(arguments.category, arguments.variant)
     if not 0 <= arguments.noise_std < 1:
         raise ValueError(f"--noise-std must be in [0, 1), not {arguments.noise_std}")
+    if arguments.view == "complete" and arguments.points > POOL_SIZE:
+        raise ValueError(f"--points must be at most {POOL_SIZE} of complete clouds, not {arguments.points}")
     built_in = arguments.category in category_names()
     return SetOptions(
         category=spec.name,

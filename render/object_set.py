@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from datamodules.manifest import SPLITS, Manifest, ShardEntry
 from render.category import CategorySpec
-from render.journal import generator_version
+from render.journal import Contents, contents_of, generator_version
 from render.reading import broken, read_all
 from render.shard_task import ObjectCheck, SetOptions, ShardResult, ShardTask, plan_shards
 
@@ -20,11 +20,18 @@ class ObjectSet:
         options: Of the set.
         instances: Instance ids of each split.
         left_out: Why, by id, other objects of the source are not in it.
+        checksums: SHA-256 of each instance as it was read; empty of procedural ones.
     """
 
     options: SetOptions
     instances: dict[str, tuple[str, ...]]
     left_out: dict[str, str]
+    checksums: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def contents(self) -> Contents:
+        """For comparison with a set that was made, or begun, before."""
+        return contents_of(self.instances, self.left_out, self.checksums)
 
     def tasks(self, folder: Path) -> list[ShardTask]:
         """The shards, in order."""
@@ -60,6 +67,7 @@ class ObjectSet:
             shards=shard_entries(results),
             rejected_views=sum(result.rejected_views for result in results),
             left_out=self.left_out,
+            checksums=self.checksums,
         )
 
 
@@ -85,7 +93,7 @@ def plan_objects(
         ValueError: if the source cannot be opened, has too few instances, or unusable ones that are not to be left out.
     """
     source = options.open()
-    ids, unusable = source.instance_ids(), {}
+    ids, unusable, checksums = source.instance_ids(), {}, {}
     if options.root is not None:
         checks = [ObjectCheck(options, instance_id) for instance_id in ids]
         readings = read_all(checks, workers, scheduler, f"reading {options.category} objects")
@@ -101,9 +109,9 @@ def plan_objects(
     left_out = dict(source.left_out()) | unusable
     if options.root is not None:
         counts = f"--train-instances {options.train_instances} and --test-instances {options.test_instances}"
-        used = {instance_id for split in SPLITS for instance_id in instances[split]}
-        left_out |= dict.fromkeys((i for i in ids if i not in used), f"more than {counts} take")
-    return ObjectSet(options, instances, left_out)
+        checksums = {i: readings[i].checksum for split in SPLITS for i in instances[split]}
+        left_out |= dict.fromkeys((i for i in ids if i not in checksums), f"more than {counts} take")
+    return ObjectSet(options, instances, left_out, checksums)
 
 
 def split_instances(options: SetOptions, ids: list[str]) -> dict[str, tuple[str, ...]]:

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from articulate_ssl.geometry.screw import REVOLUTE
+from render.arguments import at_least
 from render.articulated_object import ArticulatedObject
 from render.category import CategorySpec, category_names, load_category
 from render.depth_renderer import RendererUnavailable
@@ -156,7 +157,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--source", default="procedural", choices=tuple(SOURCES))
     parser.add_argument("--root", type=Path, help="folder of an external source's data set")
     parser.add_argument("--variant", help="of the category's procedural designs")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=at_least(0), default=0)
     parser.add_argument("--out", type=Path, default=Path("build/preview"), help="folder")
     arguments = parser.parse_args(argv)
     variant = f"-{arguments.variant}" if arguments.variant else ""

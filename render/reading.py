@@ -35,17 +35,15 @@ def broken(readings: dict[str, Reading], root: str, kind: str, skip: bool) -> di
         ValueError: naming every one, if there is any and they are not to be skipped, or nothing is left.
     """
     problems = {name: reading.problem for name, reading in readings.items() if reading.problem}
+    folder = os.path.join(Path(root), "")  # as messages have it, without ./ or a second /
     if problems and (not skip or len(problems) == len(readings)):
         remedy = "repair or remove them"
         remedy += ", or leave them out with --skip-broken" if len(problems) < len(readings) else ""
-        listed = "".join(f"\n  {_about(name, problem)}" for name, problem in problems.items())
+        # A path below the root names its object; any other message could be about any of them.
+        named = (folder, f"{Path(root)}: ")
+        listed = [problem if problem.startswith(named) else f"{name}: {problem}" for name, problem in problems.items()]
         raise ValueError(
             f"{len(problems)} of {len(readings)} {kind} in {root} cannot be used; {remedy}, and repeat the command:"
-            f"{listed}"
+            + "".join(f"\n  {problem}" for problem in listed)
         )
-    prefix = os.path.join(Path(root), "")  # as messages have it, without ./ or a second /
-    return {name: f"broken: {problem.replace(prefix, '')}" for name, problem in problems.items()}
-
-
-def _about(name: str, problem: str) -> str:
-    return problem if name in problem else f"{name}: {problem}"
+    return {name: f"broken: {problem.replace(folder, '')}" for name, problem in problems.items()}

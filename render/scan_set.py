@@ -16,15 +16,16 @@ import numpy as np
 
 from datamodules.manifest import SPLITS, Manifest
 from datamodules.point_cloud_io import SUFFIXES, read_scan
-from datamodules.shards import SHARD_ARRAYS, UNLABELLED_ARRAYS, write_shard
+from datamodules.shards import SHARD_ARRAYS, UNLABELLED_ARRAYS, sha256_of, write_shard
 from render.category import CategorySpec, parse_category
-from render.journal import generator_version
+from render.journal import Contents, contents_of, generator_version
 from render.object_set import shard_entries
 from render.posing import sample_rotation
 from render.reading import broken, read_all
 from render.scan_cloud import choose_points, refuse_camera, size_of
 from render.seeds import generator_for
 from render.shard_task import SAMPLES_PER_SHARD, Reading, ShardResult
+from render.sources.dataset_folder import files_below
 
 SOURCE = "clouds"
 NORMALISE = ("object", "scan", "none")
@@ -131,7 +132,8 @@ class ScanCheck:
             points, notes = self.options.cloud(self.scan)
         except (ValueError, OSError) as error:
             return ScanReading(self.scan, str(error))
-        return ScanReading(self.scan, "", size_of(points), notes)
+        checksum = sha256_of(os.path.join(self.options.root, self.scan))
+        return ScanReading(self.scan, checksum=checksum, size=size_of(points), notes=notes)
 
 
 @dataclass(frozen=True)
@@ -188,6 +190,7 @@ class ScanSet:
         scales: By which each scan is divided.
         left_out: Why, by id, other scans or objects are not in it.
         split_by: `instance` or `scan`.
+        checksums: SHA-256 of the file of each scan.
     """
 
     options: ScanSetOptions
@@ -196,6 +199,17 @@ class ScanSet:
     scales: dict[str, float]
     left_out: dict[str, str]
     split_by: str
+    checksums: dict[str, str]
+
+    @property
+    def contents(self) -> Contents:
+        """For comparison with a set that was made, or begun, before."""
+        return contents_of(self.files, self.left_out, self.checksums)
+
+    @property
+    def files(self) -> dict[str, tuple[str, ...]]:
+        """Paths of each split's scans below the root, in the order of the samples."""
+        return {split: tuple(scan for scan, _ in self.scans[split]) for split in SPLITS}
 
     def tasks(self, folder: Path) -> list[ScanShardTask]:
         """The shards, in order."""
@@ -231,7 +245,8 @@ class ScanSet:
             left_out=self.left_out,
             labelled=False,
             split_by=self.split_by,
-            scans={split: tuple(scan for scan, _ in self.scans[split]) for split in SPLITS},
+            scans=self.files,
+            checksums=self.checksums,
         )
 
 
@@ -281,7 +296,9 @@ def plan_scans(
             "docs/own_data.md says how many"
         )
     numbers = {f"{split}_instances": len(instances[split]) for split in SPLITS}
-    return ScanSet(replace(options, **numbers), instances, scans, scales, left_out, split_by), lines + of_scales
+    checksums = {scan: readings[scan].checksum for split in SPLITS for scan, _ in scans[split]}
+    plan = ScanSet(replace(options, **numbers), instances, scans, scales, left_out, split_by, checksums)
+    return plan, lines + of_scales
 
 
 def find_scans(root: str) -> tuple[list[str], list[tuple[str, int]]]:
@@ -291,16 +308,14 @@ def find_scans(root: str) -> tuple[list[str], list[tuple[str, int]]]:
 
     Raises:
         ValueError: if there is no such folder, or no scan in it.
+        OSError: if a folder in it cannot be read.
     """
     if not os.path.isdir(root):
         raise ValueError(f"{root}: not a folder; --root must name the folder of the scans")
     scans, others = [], Counter()
-    for path in sorted(Path(root).rglob("*")):
-        below = path.relative_to(root)
-        if any(part.startswith(".") for part in below.parts) or not path.is_file():
-            continue
+    for path in files_below(Path(root)):
         if path.suffix.lower() in SUFFIXES:
-            scans.append(below.as_posix())
+            scans.append(path.relative_to(root).as_posix())
         else:
             others[path.suffix.lower()] += 1
     if not scans:

@@ -197,10 +197,12 @@ class Reading:
     Attributes:
         name: Its id.
         problem: Why it cannot be used, naming its file; empty if it can.
+        checksum: SHA-256 of what was read; empty if it cannot be used.
     """
 
     name: str
     problem: str = ""
+    checksum: str = ""
 
 
 @dataclass(frozen=True)
@@ -212,6 +214,7 @@ class ObjectCheck:
 
     def make(self) -> Reading:
         """Whether shards can be made of it."""
+        load_instance.cache_clear()  # a process that lives on may remember what the files said before
         try:
             instance = load_instance(self.options, self.instance_id)
             if self.options.view == "complete":
@@ -223,7 +226,7 @@ class ObjectCheck:
                     sensor.observe(instance.part_motion(state), rng)
         except (ValueError, OSError) as error:
             return Reading(self.instance_id, str(error))
-        return Reading(self.instance_id)
+        return Reading(self.instance_id, checksum=instance.checksum())
 
 
 def _generator(task: ShardTask, *key: str | int) -> np.random.Generator:

@@ -22,7 +22,7 @@ _TEMPLATE = """\
 # {category}: {parts} parts, {joint_type} joints, your own scans. Paper size. This file is yours: nothing overwrites it.
 # On a CPU:  {cpu_command}
 data:
-  category: {category}
+  category: {quoted_category}
   root: {root}
   source: {source}
   view: {view}
@@ -86,6 +86,7 @@ def write_training_config(
         upright = f"  orientation_range: {_UPRIGHT_DEG}  # degrees; 180 if the camera was not held upright\n"
         text = _TEMPLATE.format(
             category=spec.name,
+            quoted_category=_yaml(spec.name),
             parts=len(spec.parts),
             joint_type=joint_type,
             cpu_command=on_cpu,

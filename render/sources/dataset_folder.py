@@ -1,4 +1,4 @@
-"""What the data-set sources share: finding one folder per instance, and reading JSON."""
+"""What the sources share: finding one folder per instance, or all files, and reading JSON."""
 
 from __future__ import annotations
 
@@ -53,6 +53,27 @@ def _folders_with(marker: str, folder: Path, depth: int) -> Iterator[Path]:
             yield below
         else:
             yield from _folders_with(marker, below, depth - 1)
+
+
+def files_below(folder: Path, above: frozenset[Path] | None = None) -> Iterator[Path]:
+    """All files below a folder but hidden ones and those in hidden folders, sorted; symbolic links are followed.
+
+    Args:
+        folder: Where to look.
+        above: Folders that are not entered again, as a link may lead back to one: those on the way to `folder`.
+
+    Raises:
+        OSError: if a folder cannot be read.
+    """
+    place = folder.resolve()
+    above = frozenset(place.parents) if above is None else above
+    if place in above:
+        return
+    for path in sorted(path for path in folder.iterdir() if not path.name.startswith(".")):
+        if path.is_dir():
+            yield from files_below(path, above | {place})
+        elif path.is_file():
+            yield path
 
 
 def read_json(file: Path) -> Any:

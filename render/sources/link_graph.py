@@ -15,6 +15,8 @@ from render.articulated_object import ArticulatedObject, Joint
 from render.sources.mesh_loading import concatenate, transformed
 
 FIXED = None
+# Of a part, in any unit: rays are cast in single precision, which the squares of sizes far beyond these leave.
+_SMALLEST, _LARGEST = 1e-12, 1e12
 
 
 @dataclass(frozen=True)
@@ -201,6 +203,11 @@ def merge_links(
         mesh.remove_unreferenced_vertices()
         if len(mesh.faces) == 0:
             raise ValueError(f"{graph.file}: part {name!r} is empty, none of its links has a mesh")
+        if not _SMALLEST < (size := mesh.extents.max()) < _LARGEST:
+            raise ValueError(
+                f"{graph.file}: part {name!r} is {size:.3g} large; correct its mesh or mesh scale to a size between "
+                f"{_SMALLEST:g} and {_LARGEST:g}"
+            )
         if mesh.area <= 0:
             raise ValueError(f"{graph.file}: part {name!r} has no surface area, its mesh or mesh scale is degenerate")
     joints = tuple(_merged_joint(joint, part_of, graph.file) for joint in modelled)

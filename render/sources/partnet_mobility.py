@@ -96,7 +96,10 @@ class PartNetMobilitySource(Source):
         meta = folder / "meta.json"
         if not meta.exists():  # some copies of the data set come without: the parts alone decide
             return True
-        return read_json(meta).get("model_cat") in self.spec.recognition.rules(SOURCE)["model_cat"]
+        content = read_json(meta)
+        if not isinstance(content, dict):
+            raise ValueError(f"{meta}: is not a JSON object; it needs a model_cat, or delete it: the parts decide then")
+        return content.get("model_cat") in self.spec.recognition.rules(SOURCE)["model_cat"]
 
     def _mismatch(self, folder: Path) -> str:
         """How the parts differ from the category's; empty if they do not."""

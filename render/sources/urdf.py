@@ -23,6 +23,7 @@ import yourdfpy
 from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE
 from render.articulated_object import ArticulatedObject
 from render.sources import Source
+from render.sources.dataset_folder import files_below
 from render.sources.link_graph import FIXED, Link, LinkGraph, LinkJoint, tree_order
 from render.sources.mesh_loading import concatenate, load_mesh, parse_xml, resolve_inside, transformed
 from render.sources.part_matching import require_rules, to_category
@@ -32,6 +33,15 @@ if TYPE_CHECKING:
 
 Z_UP_TO_Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 JOINT_TYPES = MappingProxyType({"fixed": FIXED, "revolute": REVOLUTE, "continuous": REVOLUTE, "prismatic": PRISMATIC})
+# The children and the attributes that are read of an element; the others may hold what they like.
+_READ = {
+    "robot": (("link", "joint"), ("name",)),
+    "link": (("visual",), ("name",)),
+    "visual": (("origin", "geometry"), ()),
+    "joint": (("parent", "child", "origin", "axis", "limit", "mimic"), ("name", "type")),
+    "limit": ((), ("lower", "upper")),
+    "mimic": ((), ("joint",)),
+}
 # How many blank-separated numbers the attributes that matter here may hold.
 _NUMBERS = {
     "origin": {"xyz": (3,), "rpy": (3,)},
@@ -42,12 +52,13 @@ _NUMBERS = {
     "cylinder": {"radius": (1,), "length": (1,)},
     "sphere": {"radius": (1,)},
 }
-_SHAPES = {"mesh": ["filename"], "box": ["size"], "cylinder": ["radius", "length"], "sphere": ["radius"]}
+_SIZED = {"box": ["size"], "cylinder": ["radius", "length"], "sphere": ["radius"]}
+_SHAPES = {"mesh": ["filename"]} | _SIZED
 
 
 @dataclass(frozen=True)
 class UrdfSource(Source):
-    """Instances are URDF files; their ids are the paths below the root folder, without suffix."""
+    """Instances are URDF files; their ids are the paths below the root folder, without `.urdf`."""
 
     spec: CategorySpec
     root: Path
@@ -68,7 +79,7 @@ class UrdfSource(Source):
 
 
 def open(spec: CategorySpec, root: Path | None, seed: int) -> UrdfSource:
-    """Source of all `*.urdf` files below a folder, or of one file; `seed` is not used.
+    """Source of all `*.urdf` files (of any case) below a folder, or of one file; `seed` is not used.
 
     Raises:
         ValueError: if there are none.
@@ -79,10 +90,12 @@ def open(spec: CategorySpec, root: Path | None, seed: int) -> UrdfSource:
     root = Path(root)
     if root.is_file():
         return UrdfSource(spec, root.parent, {root.stem: root})
-    files = {path.relative_to(root).with_suffix("").as_posix(): path for path in root.rglob("*.urdf")}
-    if not files:
-        raise ValueError(f"{root}: {'no *.urdf file in this folder' if root.is_dir() else 'no such folder'}")
-    return UrdfSource(spec, root, files)
+    if not root.is_dir():
+        raise ValueError(f"{root}: no such folder")
+    found = [path for path in files_below(root) if path.suffix.lower() == ".urdf"]
+    if not found:
+        raise ValueError(f"{root}: no *.urdf file in this folder")
+    return UrdfSource(spec, root, {path.relative_to(root).as_posix().removesuffix(".urdf"): path for path in found})
 
 
 def read_urdf(file: Path, root: Path, below_root: bool = False) -> LinkGraph:
@@ -122,15 +135,24 @@ def _parse(file: Path) -> yourdfpy.urdf.Robot:
     if xml.tag != "robot":
         raise ValueError(f"{file}: is not a URDF, its outermost element is <{xml.tag}> instead of <robot>")
     xml.attrib.setdefault("name", file.stem)
-    for unused in [element for element in xml if element.tag not in ("link", "joint")]:
-        xml.remove(unused)
-    for link in xml.findall("link"):
-        for unused in [element for element in link if element.tag != "visual"]:
-            link.remove(unused)
+    _drop_unread(xml)
     _check_required(xml, file)
     _check_numbers(xml, file)
     stream = io.BytesIO(ElementTree.tostring(xml))
-    return yourdfpy.URDF.load(stream, build_scene_graph=False, load_meshes=False).robot
+    try:
+        return yourdfpy.URDF.load(stream, build_scene_graph=False, load_meshes=False).robot
+    except Exception as error:  # it raises whatever a malformed file runs it into
+        raise ValueError(f"{file}: not a readable URDF ({type(error).__name__}: {error})") from error
+
+
+def _drop_unread(element: ElementTree.Element) -> None:
+    if element.tag not in _READ:
+        return
+    children, attributes = _READ[element.tag]
+    element.attrib = {name: value for name, value in element.attrib.items() if name in attributes}
+    element[:] = [child for child in element if child.tag in children]
+    for child in element:
+        _drop_unread(child)
 
 
 def _check_required(xml: ElementTree.Element, file: Path) -> None:
@@ -173,6 +195,8 @@ def _check_numbers(xml: ElementTree.Element, file: Path) -> None:
                 raise ValueError(
                     f"{file}: <{element.tag} {attribute}={text!r}> has {len(values)} numbers, not {counts[0]}"
                 )
+            if element.tag in _SIZED and min(values) <= 0:
+                raise ValueError(f"{file}: <{element.tag} {attribute}={text!r}> is not positive; a size must be")
 
 
 def _link_poses(robot: yourdfpy.urdf.Robot, file: Path) -> dict[str, np.ndarray]:

@@ -214,6 +214,12 @@ def test_scans_of_nothing_but_objects_that_views_test_are_refused(tmp_path):
         scans_of(tmp_path, "test-0", "test-1").discovery_dataloader(100, scans=True)
 
 
+def test_scans_that_are_not_there_are_refused_whatever_reads_them(tmp_path, synthetic_set):
+    with pytest.raises(ManifestError, match=r"nowhere/manifest\.json: manifest is missing"):
+        data(tmp_path, scans=str(tmp_path / "nowhere")).setup("fit")
+    data(tmp_path, scans=str(tmp_path / "nowhere")).setup("test")
+
+
 def test_a_category_of_one_object_is_learnt_from_its_scans(tmp_path):
     module = scans_of(tmp_path, "test-0")
     replace(module.manifest, split_by="scan").save(module.folder)
@@ -291,6 +297,8 @@ def test_a_set_of_another_category_is_refused(tmp_path, synthetic_set):
         ({"noise_std": -0.1}, "noise_std=-0.1, must be at least 0"),
         ({"max_test_samples": 0}, "max_test_samples=0"),
         ({"protocol": "eap"}, "only partial views have a protocol"),
+        ({"view": "sideways"}, "view='sideways', expected one of complete, partial"),
+        ({"view": "partial", "protocol": "foo"}, "protocol='foo', expected one of honest, eap"),
     ],
 )
 def test_senseless_arguments_are_refused(options, message):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -217,3 +218,11 @@ def test_shards_that_contradict_the_manifest_about_labels_are_refused(tmp_path):
     Manifest.load(labelled).save(bare)
     with pytest.raises(ShardError, match="shard has no labels, the manifest says otherwise"):
         ArticulatedDataset(bare, "train", 32, verify=False)
+
+
+def test_a_shard_of_objects_that_the_manifest_does_not_name_is_refused(synthetic_set):
+    manifest = Manifest.load(synthetic_set)
+    rest = {name: state for name, state in manifest.rest_state.items() if name != "test-1"}
+    replace(manifest, instances=manifest.instances | {"test": ("test-0",)}, rest_state=rest).save(synthetic_set)
+    with pytest.raises(ShardError, match=r"test/shard-00001\.npz: shard has instance 1, but the manifest names 1 of"):
+        ArticulatedDataset(synthetic_set, "test", 32)

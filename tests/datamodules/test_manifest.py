@@ -27,7 +27,7 @@ def test_saving_what_was_loaded_gives_the_same_bytes(synthetic_set, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"schema_version": 99}, "schema version is 99, this program reads version 3"),
+        ({"schema_version": 99}, "schema version is 99, this program reads version 4"),
         ({"schema_version": "remove"}, "schema version is None"),
         ({"seed": "remove"}, "missing fields: seed"),
         ({"mood": 1}, "unknown fields: mood"),
@@ -41,7 +41,19 @@ def test_saving_what_was_loaded_gives_the_same_bytes(synthetic_set, tmp_path):
         ({"split_by": "mood"}, "split_by is 'mood'"),
         ({"scans": {"train": []}}, "scans names the splits"),
         ({"joint_types": [0, 0]}, "2 entries"),
-        ({"joint_types": ["hinge"]}, "joint_types are"),
+        ({"joint_types": [2]}, "joint_types are"),
+        ({"joint_types": ["hinge"]}, "joint_types is"),
+        ({"options": []}, "options is"),
+        ({"options": None}, "options is None, expected dict"),
+        ({"articulation_range": [[None, None]]}, "articulation_range is"),
+        ({"articulation_range": [["a", "b"]]}, "articulation_range is"),
+        ({"articulation_range": [[0.0, float("nan")]]}, "articulation_range is"),
+        ({"rest_state": {f"{s}-{i}": [None] for s, n in (("train", 3), ("test", 2)) for i in range(n)}}, "rest_state"),
+        ({"instances": {"train": "abc", "test": ["d"]}}, "instances is"),
+        ({"scans": None}, "scans is None"),
+        ({"checksums": {"a": None}}, "checksums is"),
+        ({"shards": {"train": [{"name": "a", "samples": 1, "sha256": None}], "test": []}}, "sha256 is None"),
+        ({"shards": {"train": [{"name": "a", "samples": "1", "sha256": ""}], "test": []}}, "samples is '1'"),
         ({"shards": {"train": [{"name": "a", "samples": 0, "sha256": ""}], "test": []}}, "a shard has no samples"),
         ({"shards": {"train": [{"name": "../a", "samples": 1, "sha256": ""}], "test": []}}, "plain file names"),
         ({"shards": {"train": [{"name": "a"}], "test": []}}, "damaged"),
@@ -70,6 +82,12 @@ def test_version_2_knew_labelled_sets_only(synthetic_set):
     manifest = Manifest.load(synthetic_set)
     edit(synthetic_set, schema_version=2, labelled="remove", split_by="remove", scans="remove")
     assert Manifest.load(synthetic_set) == manifest and manifest.labelled
+
+
+def test_version_3_did_not_record_checksums(synthetic_set):
+    manifest = Manifest.load(synthetic_set)
+    edit(synthetic_set, schema_version=3, checksums="remove")
+    assert Manifest.load(synthetic_set) == manifest
 
 
 def test_a_set_without_labels_needs_no_rest_states_and_may_split_one_object(synthetic_set, tmp_path):

@@ -82,3 +82,16 @@ def test_cyclic_trees_are_refused():
     slide, swing = chain.joints
     with pytest.raises(ValueError, match=r"instance 'chain'.*cycle"):
         replace(chain, joints=(replace(slide, parent=2), swing)).validate()
+
+
+def test_the_checksum_is_of_everything_that_clouds_are_made_from():
+    chain = box_chain()
+    assert box_chain().checksum() == chain.checksum()
+    moved = chain.meshes[2].copy()
+    moved.vertices[0] += 0.01
+    others = [
+        replace(chain, meshes=(*chain.meshes[:2], moved)),
+        replace(chain, joints=(chain.joints[0], replace(chain.joints[1], upper=0.6))),
+        replace(chain, part_names=("cabinet", "drawer", "lid")),
+    ]
+    assert len({chain.checksum(), *(other.checksum() for other in others)}) == 4

@@ -119,3 +119,13 @@ def test_directions_are_even():
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1)
     assert np.linalg.norm(directions.mean(0)) < 0.02
     assert cKDTree(directions).query(directions, k=2)[0][:, 1].min() > 0.2
+
+
+def test_a_cloud_in_which_a_part_has_no_point_is_drawn_again():
+    laptop = box_laptop()
+    surface, still = surface_of(laptop), laptop.part_motion(np.array([1.0]))
+    surface.part_id[:] = np.arange(len(surface.part_id)) % 20 == 0  # one point in twenty is of the lid
+    for seed in range(20):
+        assert set(surface.cloud(still, 12, np.random.default_rng(seed))[1]) == {0, 1}
+    with pytest.raises(ValueError, match=r"'box': part '(base|lid)' has none of 1 points; pass more --points"):
+        surface.cloud(still, 1, np.random.default_rng(0))

@@ -283,6 +283,34 @@ def test_a_torn_journal_line_is_made_again(tmp_path, complete_set):
     assert_same(contents(folder), contents(complete_set))
 
 
+def begin(complete_set: Path, out: Path, journal: bytes) -> Path:
+    """Copy a set as if its run had been interrupted before the manifest, with such a journal."""
+    folder = set_folder(out, "laptop")
+    shutil.copytree(complete_set, folder)
+    (folder / "manifest.json").unlink()
+    (folder / ".journal.jsonl").write_bytes(journal)
+    return folder
+
+
+@pytest.mark.parametrize("journal", [b"", b"5\n", b"\xff\xfe\x00", b"[]\n"])
+def test_a_journal_without_a_readable_line_is_begun_anew(tmp_path, complete_set, journal):
+    folder = begin(complete_set, tmp_path, journal)
+    make(tmp_path)
+    assert_same(contents(folder), contents(complete_set))
+
+
+def test_damaged_lines_of_a_journal_are_skipped_but_for_the_first(tmp_path, complete_set, capsys):
+    manifest = json.loads((complete_set / "manifest.json").read_text())
+    header = json.dumps({"generator_version": manifest["generator_version"], **manifest["options"]}).encode()
+    folder = begin(complete_set, tmp_path, header + b'\n5\n{"split": "train"}\n\xff\n')
+    make(tmp_path)
+    assert_same(contents(folder), contents(complete_set))
+    begin(complete_set, tmp_path / "other", b'5\n{"split": "train"}\n')
+    assert main(["--category", "laptop", "--out", str(tmp_path / "other"), *SMALL]) == 2
+    message = capsys.readouterr().err
+    assert ".journal.jsonl: is damaged" in message and "delete it" in message
+
+
 def test_other_options_in_the_same_folder_are_refused(tmp_path, complete_set, capsys):
     out = complete_set.parents[1]
     before = contents(complete_set)
@@ -305,7 +333,7 @@ def test_other_options_in_the_same_folder_are_refused(tmp_path, complete_set, ca
         (["--category", "laptop", "--source", "urdf", "--root", "/no/such/folder"], "/no/such/folder"),
         (["--category", "laptop", "--train-instances", "0", "--test-instances", "0"], "nothing to make"),
         (["--category", "laptop", "--train-instances", "99999999"], "has 10000 instances"),
-        (["--category", "laptop", "--points", "999999"], "cannot choose 999999"),
+        (["--category", "laptop", "--points", "32769"], "--points must be at most 32768 of complete clouds, not 32769"),
     ],
 )
 def test_bad_arguments_exit_with_2_and_one_message(tmp_path, capsys, options, message):

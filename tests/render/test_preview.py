@@ -1,6 +1,7 @@
 """The contact sheet and its command line."""
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from render.category import load_category
@@ -38,3 +39,9 @@ def test_command_line_reports_bad_input_in_one_line(tmp_path, capsys):
     assert main(["--category", "safe", "--root", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     assert capsys.readouterr().err.startswith("error: source 'procedural' reads no files")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_negative_seed_is_refused_by_its_option(capsys):
+    with pytest.raises(SystemExit):
+        main(["--category", "safe", "--seed", "-1"])
+    assert "argument --seed: must be at least 0, not -1" in capsys.readouterr().err

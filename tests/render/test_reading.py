@@ -126,3 +126,52 @@ def test_a_problem_that_names_nothing_gets_the_name_of_its_object():
     with pytest.raises(ValueError, match=r"1 of 2 objects in there.*\n  a: is hollow"):
         broken(readings, "there", "objects", skip=False)
     assert broken(readings, "there", "objects", skip=True) == {"a": "broken: is hollow"}
+
+
+def test_an_object_is_named_also_if_its_name_is_a_letter_of_the_message(tmp_path):
+    readings = {
+        "o": Reading("o", "laptop instance: a sensor reaches only 1 point"),
+        "a": Reading("a", "laptop/a.urdf: bad"),
+        "b": Reading("b"),
+    }
+    with pytest.raises(ValueError, match=r"\n  o: laptop instance: a sensor.*\n  laptop/a\.urdf: bad"):
+        broken(readings, "laptop", "objects", skip=False)
+    with pytest.raises(ValueError, match=r"\n  one\.urdf: bad"):
+        broken({"one": Reading("one", "one.urdf: bad")}, "one.urdf", "objects", skip=False)
+
+
+def add(root: Path) -> str:
+    shutil.copy(root / "a.urdf", root / "aa.urdf")
+    return "added: aa"
+
+
+def edit(root: Path) -> str:
+    file = root / "a.urdf"
+    file.write_text(file.read_text().replace('upper="1"', 'upper="0.5"'))
+    return "changed: a"
+
+
+def exchange(root: Path) -> str:
+    (root / "b.urdf").rename(root / "c.urdf")
+    return "added: c; removed: b"
+
+
+@pytest.mark.parametrize("change", [add, edit, exchange])
+@pytest.mark.parametrize("finished", [True, False])
+def test_a_set_of_other_objects_is_not_gone_on_with(tmp_path, monkeypatch, capsys, change, finished):
+    urdf(tmp_path / "root")
+    for name in "de":
+        (tmp_path / "root" / f"{name}.urdf").unlink()
+    command = ["--category", "articulated", "--source", "urdf", "--root", str(tmp_path / "root"), *SMALL]
+    command += ["--out", str(tmp_path / "out"), "--train-instances", "1", "--test-instances", "1"]
+    with monkeypatch.context() as patch:
+        if not finished:
+            patch.setattr(Manifest, "save", interrupt)
+        assert main(command) == (0 if finished else 130)
+    difference = change(tmp_path / "root")
+    assert main(command) == 2
+    assert difference in capsys.readouterr().err
+
+
+def interrupt(*_) -> None:
+    raise KeyboardInterrupt

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -139,10 +140,69 @@ def test_a_scan_that_is_added_later_is_noticed(root, tmp_path, capsys):
     make(root, tmp_path, code=2)
     assert "train_instances 4, now 5" in capsys.readouterr().err
     (root / "later.npy").rename(root / "alpha" / "later.npy")
-    for number in range(250):
+    for number in range(6):
         np.save(root / "alpha" / f"more_{number}.npy", np.load(root / "alpha" / "a.npy"))
     make(root, tmp_path, code=2)
-    assert "the source has changed" in capsys.readouterr().err
+    message = capsys.readouterr().err
+    assert "added: alpha/later.npy, alpha/more_0.npy" in message and "more_3.npy and 2 more)" in message
+
+
+def swap(root: Path) -> str:
+    """Remove a scan and add a copy of another: as many as before, and in their sorted order."""
+    (root / "alpha" / "a.npy").unlink()
+    np.save(root / "alpha" / "z.npy", scan(30))
+    return "added: alpha/z.npy; removed: alpha/a.npy"
+
+
+def replace_one(root: Path) -> str:
+    np.save(root / "alpha" / "a.npy", scan(30))
+    return "changed: alpha/a.npy"
+
+
+@pytest.mark.parametrize("change", [swap, replace_one])
+@pytest.mark.parametrize("finished", [True, False])
+def test_a_set_of_other_scans_is_not_gone_on_with(root, tmp_path, monkeypatch, capsys, change, finished):
+    shutil.copytree(root, tmp_path / "as it was")
+    with monkeypatch.context() as patch:
+        if not finished:
+            patch.setattr(Manifest, "save", interrupt)
+        folder = make(root, tmp_path, code=0 if finished else 130)
+    before = contents(folder)
+    difference = change(root)
+    make(root, tmp_path, code=2)
+    message = capsys.readouterr().err
+    assert f"({difference})" in message and f"{folder} holds a set" in message and "delete that folder" in message
+    assert contents(folder) == before
+    shutil.rmtree(root)
+    (tmp_path / "as it was").rename(root)
+    make(root, tmp_path)
+    assert verify_set(folder) == []
+
+
+def interrupt(*_) -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_what_older_versions_did_not_record_is_not_compared(root, tmp_path, monkeypatch, capsys, finished):
+    with monkeypatch.context() as patch:
+        if not finished:
+            patch.setattr(Manifest, "save", interrupt)
+        folder = make(root, tmp_path, code=0 if finished else 130)
+    file = folder / ("manifest.json" if finished else ".journal.jsonl")
+    first, *others = file.read_text().splitlines() if not finished else [file.read_text()]
+    content = json.loads(first)
+    for new in ("checksums", "contents"):
+        content.pop(new, None)
+    if finished:
+        content["schema_version"] = 3
+    file.write_text("\n".join([json.dumps(content), *others]) + "\n")
+    replace_one(root)
+    make(root, tmp_path)
+    if finished:  # which scans they were has always been recorded
+        swap(root)
+        make(root, tmp_path, code=2)
+        assert "(added: alpha/z.npy; removed: alpha/a.npy)" in capsys.readouterr().err
 
 
 def test_scans_of_one_object_are_split_and_the_manifest_says_so(tmp_path):
@@ -188,6 +248,17 @@ def test_hidden_files_are_not_looked_at(root):
     scans, ignored = find_scans(str(root))
     assert not any("._" in name or ".trash" in name for name in scans) and ignored == [(".txt", 1)]
     assert object_of("delta/session_1/a.npy") == "delta" and object_of("single.npz") == "single.npz"
+
+
+def test_links_are_followed_but_not_in_circles(root, tmp_path):
+    (tmp_path / "elsewhere" / "deep").mkdir(parents=True)
+    (tmp_path / "elsewhere" / "deep" / "a.NPY").touch()
+    expected = find_scans(str(root))[0]
+    (root / "linked").symlink_to(tmp_path / "elsewhere")
+    (root / "alpha" / "back").symlink_to(root)
+    (root / "up").symlink_to(tmp_path)
+    (tmp_path / "elsewhere" / "deep" / "again").symlink_to(tmp_path / "elsewhere")
+    assert find_scans(str(root))[0] == sorted([*expected, "linked/deep/a.NPY"])
 
 
 def test_all_broken_scans_are_named_at_once_and_can_be_left_out(root, tmp_path, capsys):
@@ -276,6 +347,14 @@ def test_a_training_configuration_is_written_once(root, tmp_path, capsys):
     make(root, tmp_path)
     assert config.read_text() == "# mine\n"
     assert "kept as it is" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["45427", "on", "null", "1e3"])
+def test_a_category_is_a_name_whatever_yaml_takes_it_for(root, tmp_path, name):
+    category = ["--category", name, *MYBOX[2:]]
+    make(root, tmp_path, category=category)
+    content = yaml.safe_load((tmp_path / name / "clouds-complete" / "config.yaml").read_text())
+    assert content["data"]["category"] == name
 
 
 def test_the_configuration_of_depth_views_is_for_an_upright_camera(tmp_path):

@@ -190,6 +190,14 @@ def test_articulated_takes_all_joints_as_they_are(tmp_path):
     assert (safe.joints[1].lower, safe.joints[1].upper) == (-np.pi, np.pi)
 
 
+@pytest.mark.parametrize("content", ["[1]", "null"])
+def test_a_meta_file_that_is_no_object_is_a_broken_instance(tmp_path, content):
+    partnet_safe(tmp_path / "101")
+    (tmp_path / "101" / "meta.json").write_text(content)
+    with pytest.raises(ValueError, match=r"101/meta\.json: is not a JSON object"):
+        load(tmp_path, "safe", "101")
+
+
 def test_errors_name_the_file(tmp_path):
     folder = partnet_safe(tmp_path / "101")
     (folder / "semantics.txt").write_text("link_0 heavy\n")

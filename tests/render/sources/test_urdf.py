@@ -227,7 +227,15 @@ TWO_LINKS = urdf_link("a") + urdf_link("b")
         (TWO_LINKS + '<joint type="fixed"><parent link="a"/><child link="b"/></joint>', "<joint> '' has no attribute"),
         ("<link/>", "<link> '' has no attribute 'name'"),
         (urdf_link("a") + '<link name="b"/>' + urdf_joint("j", "a", "b"), "part 'b' is empty"),
-        (urdf_link("a") + urdf_link("b", "0 0 0") + urdf_joint("j", "a", "b"), "part 'b' has no surface area"),
+        (urdf_link("a") + urdf_link("b", "0 0 0") + urdf_joint("j", "a", "b"), "<box size='0 0 0'> is not positive"),
+        (urdf_link("a") + urdf_link("b", "1 -1 1") + urdf_joint("j", "a", "b"), "<box size='1 -1 1'> is not positive"),
+        (TWO_LINKS.replace('<box size="1 1 1"', '<sphere radius="0"'), "<sphere radius='0'> is not positive"),
+        (
+            TWO_LINKS.replace('<box size="1 1 1"', '<cylinder radius="1" length="-1"'),
+            "<cylinder length='-1'> is not positive",
+        ),
+        (urdf_link("a") + urdf_link("b", "1e60 1 1") + urdf_joint("j", "a", "b"), "part 'b' is 1e\\+60 large"),
+        (urdf_link("a") + urdf_link("b", "1e-60 1e-60 1e-60") + urdf_joint("j", "a", "b"), "part 'b' is 1e-60 large"),
         ('<link name="a"><visual/></link>', "needs a <geometry>|must have one <geometry>"),
         (
             '<link name="a"><visual><geometry><mesh/></geometry></visual></link>',
@@ -284,6 +292,39 @@ def test_other_roots_and_files_are_refused(tmp_path):
     for folder, message in (("empty", r"no \*\.urdf file in this folder"), ("nowhere", "no such folder")):
         with pytest.raises(ValueError, match=message):
             open_source("urdf", load_category("laptop"), tmp_path / folder, 0)
+
+
+def test_what_is_not_read_may_hold_anything(tmp_path):
+    limit = '<limit lower="0" upper="1" effort="abc" velocity=""/>'
+    extra = '<safety_controller k_velocity="x"/><calibration rising="x"/><dynamics damping="x"/>'
+    body = TWO_LINKS.replace("<visual>", '<visual><material name="m"><color rgba="red"/></material>')
+    write_urdf(tmp_path / "a.urdf", body + urdf_joint("j", "a", "b", limit=limit, extra=extra))
+    assert load(tmp_path, "articulated").joints[0].upper == 1
+    write_urdf(tmp_path / "a.urdf", TWO_LINKS + urdf_joint("j", "a", "b", extra='<mimic joint="k" multiplier="x"/>'))
+    with pytest.raises(ValueError, match=r"a\.urdf: joint 'j' mimics 'k'"):
+        load(tmp_path, "articulated")
+
+
+def test_what_the_parser_cannot_read_is_one_error_that_names_the_file(tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise AttributeError("no such thing")
+
+    monkeypatch.setattr(yourdfpy.URDF, "load", fail)
+    write_urdf(tmp_path / "a.urdf", TWO_LINKS + urdf_joint("j", "a", "b"))
+    with pytest.raises(ValueError, match=r"a\.urdf: not a readable URDF \(AttributeError: no such thing\)"):
+        load(tmp_path, "articulated")
+
+
+def test_files_are_found_through_links_and_with_suffixes_of_any_case(tmp_path):
+    body = TWO_LINKS + urdf_joint("j", "a", "b")
+    write_urdf(tmp_path / "elsewhere" / "x.urdf", body)
+    for name in ("a.urdf", "a.URDF"):
+        write_urdf(tmp_path / "root" / name, body)
+    (tmp_path / "root" / "linked").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "root" / "linked" / "back").symlink_to(tmp_path / "root")
+    source = open_source("urdf", load_category("articulated"), tmp_path / "root", 0)
+    assert source.instance_ids() == ["a", "a.URDF", "linked/x"]
+    assert len(source.load("linked/x").joints) == 1
 
 
 def test_mesh_scale_package_path_and_primitives(tmp_path):
