@@ -1,17 +1,18 @@
 """Reading a scan: from .ply, .pcd, .npy, .npz or .obj to a checked cloud, in the units and the frame of the file.
 
 What commands predict and what `make data SOURCE=clouds` stores is read by this one function. A cloud that cannot be one
-scan of an object is refused; far outliers, which would decide the scale of everything else, are left out and counted.
+scan of an object is refused; pixels without depth, which depth cameras set to one place, and far outliers, which would
+decide the scale of everything else, are left out and counted.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import trimesh
@@ -25,6 +26,9 @@ _LINE = 1e-3
 # categories none reaches beyond 1.7 times; five spares what is longer and thinner.
 _FAR = 5.0
 _WITHIN = 0.9
+# Share of the points that lie at one place, and times as many as at any other, from which on they are no surface.
+# Quantised clouds repeat points, but many places about alike. Chosen.
+_CROWDED, _CROWDED_MORE = 0.01, 10
 
 logger = logging.getLogger(__name__)
 
@@ -62,8 +66,10 @@ def read_scan(path: str | os.PathLike) -> Scan:
     """Read a scan of one object.
 
     A .ply or .obj that holds a mesh gives `MESH_SAMPLES` points, drawn uniformly over its surface with a fixed seed:
-    mesh vertices alone are a poor sample of flat parts. An .npz holds its cloud as `points`. Points more than five
-    times as far from the median point as nine tenths of all points are left out.
+    mesh vertices alone are a poor sample of flat parts. An .npz holds its cloud as `points`. Left out are points that
+    all lie at one place, more than a hundredth of the cloud and more than ten times as many as at any other (organised
+    clouds of depth cameras have all pixels without depth at the origin), and points more than five times as far from
+    the median point as nine tenths of all points.
 
     Raises:
         PointCloudError: if the file is missing, of an unsupported kind, damaged, or holds no usable cloud.
@@ -89,31 +95,63 @@ def usable_scan(
     points: np.ndarray,  # [N, 3]
     notes: Sequence[str] = (),  # what is known about it already
 ) -> Scan:
-    """Points that came from anywhere, as a scan: far outliers are left out as in `read_scan`.
+    """Points that came from anywhere, as a scan: what is no part of the object is left out as in `read_scan`.
 
     Raises:
         PointCloudError: if they are no usable cloud.
     """
     _check_cloud(name, points)
     points, notes = points.astype(np.float64), list(notes)
-    near = _near(points)
-    if not near.all():
-        points = points[near]
-        notes.append(
-            f"{(~near).sum()} of {len(near)} points left out as outliers: more than {_FAR:g} times as far from the "
-            "middle as nine tenths of all points"
-        )
-        _check_cloud(name, points)
+    for find in (_without_depth, _far_outliers):
+        out, why = find(points)
+        if out.any():
+            points = points[~out]
+            notes.append(f"{out.sum()} of {len(out)} points left out {why}")
+            _check_cloud(f"{name}: {notes[-1]}", points)
+    _refuse_few_places(name, points)
     _refuse_line(name, points)
     return Scan(points, tuple(notes))
 
 
-def _near(
+def _without_depth(
+    points: np.ndarray,  # [N, 3] float64
+) -> tuple[np.ndarray, str]:  # [N] bool
+    """Which points are pixels without depth, or pad the cloud, and what they are left out as."""
+    place, count = _places(points)
+    crowded = int(count.argmax())
+    least = max(_CROWDED * len(points), _CROWDED_MORE * np.delete(count, crowded).max(initial=0))
+    out = (place == crowded) & (count[crowded] > least)
+    where = ", ".join(f"{value + 0.0:g}" for value in points[place == crowded][0])
+    return out, f"as pixels without depth, or padding: all of them at exactly ({where})"
+
+
+def _far_outliers(
     points: np.ndarray,  # [N, 3]
-) -> np.ndarray:  # [N] bool
-    """Which points are no far outliers."""
+) -> tuple[np.ndarray, str]:  # [N] bool
+    """Which points are far outliers, and what they are left out as."""
     distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-    return distance <= _FAR * np.quantile(distance, _WITHIN)
+    why = f"as outliers: more than {_FAR:g} times as far from the middle as nine tenths of all points"
+    return ~(distance <= _FAR * np.quantile(distance, _WITHIN)), why
+
+
+def _places(
+    points: np.ndarray,  # [N, 3] finite
+) -> tuple[np.ndarray, np.ndarray]:  # [N], [P]
+    """The number of the place where each point lies, and how many points lie exactly there."""
+    order = np.lexsort(points.T)  # a third of the time of np.unique
+    ordered = points[order]
+    place = np.zeros(len(points), dtype=np.int64)
+    place[order[1:]] = np.cumsum((ordered[1:] != ordered[:-1]).any(axis=1))
+    return place, np.bincount(place)
+
+
+def _refuse_few_places(path: str | os.PathLike, points: np.ndarray) -> None:
+    places = len(_places(points)[1])
+    if places < MIN_POINTS:
+        raise PointCloudError(
+            f"{path}: its {len(points)} points lie at {places} different places, at least {MIN_POINTS} are needed; "
+            "scan the object more densely, and do not repeat points"
+        )
 
 
 def _refuse_line(path: str | os.PathLike, points: np.ndarray) -> None:
@@ -162,14 +200,14 @@ def _read_npz(path: Path) -> np.ndarray:
             )
         try:
             return arrays["points"]
-        except (ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
+        except Exception as error:
             raise _not_plain_numpy(path) from error
 
 
 def _load_numpy(path: Path) -> np.ndarray | np.lib.npyio.NpzFile:
     try:
         return np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
+    except Exception as error:  # damaged headers are parsed as Python, damaged archives by zlib: each fails in its way
         raise _not_plain_numpy(path) from error
 
 
@@ -184,16 +222,73 @@ def _read_pcd(path: Path) -> np.ndarray:
     # Imported here because it needs system libraries (libEGL, libusb) that no other format asks for.
     import open3d
 
-    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        cloud = open3d.io.read_point_cloud(
-            str(path), format="pcd", remove_nan_points=False, remove_infinite_points=False
-        )
-    if cloud.is_empty():
+    with path.open("rb") as file:
+        header = {words[0]: words[1:] for words in _header(file, b"DATA")}
+        ascii_rows = header.get(b"DATA") == [b"ascii"]
+        if ascii_rows:
+            columns = sum(map(_integer, header.get(b"COUNT", ())))
+            _refuse_missing_rows(path, file, sum(map(_integer, header.get(b"POINTS", ()))), columns, "points")
+    read = _read_pcd_rows if ascii_rows else _read_pcd_bytes
+    try:
+        with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+            points = read(path)
+    except RuntimeError as error:
+        raise PointCloudError(f"{path}: damaged, or of types that no .pcd has; export the cloud again") from error
+    if not len(points):
         raise PointCloudError(f"{path}: damaged, or without any point; export the cloud again")
+    return points
+
+
+def _read_pcd_rows(path: Path) -> np.ndarray:
+    """By the reader that keeps all digits, but reads zeros where a binary file has numbers of 8 bytes."""
+    import open3d
+
+    cloud = open3d.io.read_point_cloud(str(path), format="pcd", remove_nan_points=False, remove_infinite_points=False)
     return np.asarray(cloud.points)
 
 
+def _read_pcd_bytes(path: Path) -> np.ndarray:
+    """By the reader that keeps the numbers of the file, but seven digits of text only."""
+    import open3d
+
+    attributes = open3d.t.io.read_point_cloud(str(path), format="pcd").point
+    return attributes.positions.numpy() if "positions" in attributes else np.empty((0, 3))
+
+
+def _header(file: BinaryIO, last: bytes) -> list[list[bytes]]:
+    """The words of every line up to the one that begins with `last`; of all lines if none does."""
+    lines = []
+    for line in file:
+        if words := line.split():
+            lines.append(words)
+            if words[0] == last:
+                break
+    return lines
+
+
+def _refuse_missing_rows(path: Path, file: BinaryIO, declared: int, columns: int, what: str) -> None:
+    """Refuse a text file that ends too early; readers take what there is, or whatever was in memory, for the rest."""
+    found = sum(len(line.split()) >= columns for line in file.read().splitlines())
+    if found < declared:
+        raise PointCloudError(f"{path}: damaged, cut off: {found} of {declared} {what}; export the cloud again")
+
+
+def _integer(word: bytes) -> int:
+    """Of a header; 0 for what is none, about which the reader of the file complains."""
+    return int(word) if word.isdigit() else 0
+
+
+def _refuse_cut_off_ply(path: Path) -> None:
+    with path.open("rb") as file:
+        header = _header(file, b"end_header")
+        if [b"format", b"ascii"] in [words[:2] for words in header]:
+            declared = sum(_integer(words[-1]) for words in header if words[0] == b"element")
+            _refuse_missing_rows(path, file, declared, 1, "rows")
+
+
 def _read_ply_or_obj(path: Path, notes: list[str]) -> np.ndarray:
+    if path.suffix.lower() == ".ply":
+        _refuse_cut_off_ply(path)
     try:
         scene = trimesh.load_scene(path, process=False, skip_materials=True)
     except Exception as error:  # damaged files make the parsers raise whatever their next line raises

@@ -17,7 +17,14 @@ from rich.table import Table
 
 from articulate_ssl.cli import BAD_INPUT
 from articulate_ssl.inference.checkpoint_file import CheckpointError
-from articulate_ssl.inference.export.formats import FORMATS, ON_REQUEST, ExportError, chosen_formats
+from articulate_ssl.inference.export.formats import (
+    FORMATS,
+    MODELS,
+    ON_REQUEST,
+    ExportError,
+    chosen_formats,
+    demand_folder,
+)
 from articulate_ssl.ops.progress import shown
 from articulate_ssl.training.shipped_weights import shipped_weights
 from articulate_ssl.training.weights_card import VIEWS, WeightsCard
@@ -75,7 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--metres-per-unit",
-        type=float,
+        type=_length,
         help="for --check: size of the scan's unit, .001 for millimetres (default: the object is taken to be half a "
         "metre large)",
     )
@@ -97,22 +104,28 @@ def run(arguments: list[str]) -> int:
     args = parser.parse_args(arguments[1:])
     if args.ckpt and args.view != AUTO:
         parser.error("--view chooses among the weights of the package: give it with --category, or leave it out")
+    if args.metres_per_unit is not None and not args.check:
+        parser.error("--metres-per-unit is for --check: give both, or leave it out")
+    if args.check and args.formats is not None and not set(MODELS) & set(args.formats):
+        parser.error(f"--check reads {' or '.join(MODELS)}: name one in --formats, or leave --formats out")
     out = args.out or Path(f"{args.cloud.stem}-prediction")
+    from articulate_ssl.inference.device import DeviceError, usable_device
     from articulate_ssl.inference.export.physics_check import PhysicsCheckError
     from articulate_ssl.ops.denormals import flush_denormals
     from datamodules.point_cloud_io import PointCloudError
 
     try:
-        device = _device(args.device)
-    except ValueError as error:
+        device = usable_device(args.device)
+    except DeviceError as error:
         parser.error(f"--device {error}")
     try:
+        demand_folder(out)
         with flush_denormals():
             candidates, chosen = _predict(args, device)
         files = _write(candidates[0], out, args)
         _print_summary(candidates, files, chosen)
         if args.check:
-            _print_check(out, args.metres_per_unit)
+            _print_check(out, files, args.metres_per_unit)
     except (PointCloudError, CheckpointError, ExportError, PhysicsCheckError, OSError) as error:
         print(f"articulate-ssl predict: {error}", file=sys.stderr)
         return BAD_INPUT
@@ -145,10 +158,11 @@ def _write(result: ScanPrediction, out: Path, args: argparse.Namespace) -> list[
     return files
 
 
-def _print_check(out: Path, metres_per_unit: float | None) -> None:
+def _print_check(out: Path, files: list[Path], metres_per_unit: float | None) -> None:
     from articulate_ssl.inference.export import physics_check
 
-    print(*physics_check.check(out, metres_per_unit).lines(), sep="\n")
+    # The folder may hold the model of an earlier prediction, in another format.
+    print(*physics_check.check(out, metres_per_unit, [file.name for file in files]).lines(), sep="\n")
 
 
 def _print_summary(candidates: list[ScanPrediction], files: list[Path], chosen: ArticulatedPoseEstimator) -> None:
@@ -205,20 +219,19 @@ def _formats(text: str) -> list[str]:
         chosen_formats(names)
     except ExportError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
+    if not names:
+        raise argparse.ArgumentTypeError(f"nothing would be written; name some of {', '.join(FORMATS)}")
     return names
 
 
-def _device(name: str) -> torch.device:
-    """Raises: ValueError if there is no such device."""
-    import torch
-
+def _length(text: str) -> float:
     try:
-        device = torch.device(name)
-    except RuntimeError as error:
-        raise ValueError(f"{name!r} is no device; use cpu, cuda or cuda:<index>") from error
-    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        raise ValueError(f"{name!r}: this machine has {torch.cuda.device_count()} CUDA devices; use cpu")
-    return device
+        length = float(text)
+    except ValueError:
+        length = math.nan
+    if not 0 < length < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is no length; use a positive number, .001 for millimetres")
+    return length
 
 
 def _parts_table(summary: dict) -> Table:

@@ -50,13 +50,17 @@ def run(arguments: list[str]) -> int:
     args = parser.parse_args(arguments[1:])
     if args.parts < 2:
         parser.error(f"--parts {args.parts}: an object that moves has at least two parts, its base included")
+    repeated = [str(path) for path in dict.fromkeys(args.scans) if args.scans.count(path) > 1]
+    if repeated:
+        parser.error(f"{', '.join(repeated)}: given more than once; give each scan once")
     from articulate_ssl.discovery.discover import DiscoveryError
-    from articulate_ssl.inference.export.formats import ExportError
+    from articulate_ssl.inference.export.formats import ExportError, demand_folder
     from articulate_ssl.inference.export.physics_check import PhysicsCheckError
     from articulate_ssl.ops.denormals import flush_denormals
     from datamodules.point_cloud_io import PointCloudError
 
     try:
+        demand_folder(args.out)
         with flush_denormals():
             _twin(args)
     except (PointCloudError, DiscoveryError, ExportError, PhysicsCheckError, OSError) as error:
@@ -74,6 +78,8 @@ def _twin(args: argparse.Namespace) -> None:
     with shown():
         twin = find_twin(clouds, args.parts, args.joint, args.seed)
     names = [path.name for path in args.scans]
+    if len(set(names)) < len(names):  # scans of several folders
+        names = [str(path) for path in args.scans]
     files = twin.export(args.out, names)
     if args.html:
         from articulate_ssl.inference.viewer import html_page

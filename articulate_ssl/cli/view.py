@@ -44,7 +44,7 @@ def run(arguments: list[str]) -> int:
 
         try:
             viewer = LiveViewer(load_scan_prediction(args.folder), args.port)
-        except ResultFolderError as error:
+        except (ResultFolderError, OSError) as error:
             print(f"articulate-ssl view: {error}", file=sys.stderr)
             return BAD_INPUT
     with viewer:

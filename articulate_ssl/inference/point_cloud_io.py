@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 
 import numpy as np
-import trimesh
 
 from articulate_ssl.ops.farthest_point import farthest_point_order
 from datamodules.atomic import atomic_write
@@ -22,10 +21,17 @@ def save_coloured_ply(
     points: np.ndarray,  # [N, 3]
     colours: np.ndarray,  # [N, 3] uint8
 ) -> None:
-    """Write a coloured cloud as binary PLY (float32 positions), whole or not at all."""
-    content = trimesh.PointCloud(points, colors=colours).export(file_type="ply")
+    """Write a coloured cloud as binary PLY, whole or not at all.
+
+    Positions are float64: in float32 points of a scan that is far from its origin (in metres of a map) collapse.
+    """
+    rows = np.empty(len(points), dtype=[("position", "<f8", 3), ("colour", "u1", 3)])
+    rows["position"], rows["colour"] = points, colours
+    properties = [f"property double {axis}" for axis in "xyz"]
+    properties += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *properties, "end_header"]
     with atomic_write(path) as file:
-        file.write(content)
+        file.write("".join(f"{line}\n" for line in header).encode() + rows.tobytes())
 
 
 def normalise_cloud(

@@ -7,6 +7,8 @@ show the same object; a category's network never is told.
 from __future__ import annotations
 
 import json
+import os
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +20,7 @@ from torch import Tensor
 from articulate_ssl.discovery.one_object.find import OneObject, find_one_object
 from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE
 from articulate_ssl.geometry.se3 import se3, transform_points
+from articulate_ssl.inference.export.formats import ExportError
 from articulate_ssl.inference.point_cloud_io import normalise_cloud
 from articulate_ssl.inference.prediction import Prediction, ScanEstimate
 from articulate_ssl.inference.scan_prediction import ScanPrediction, in_scan_frame
@@ -51,23 +54,40 @@ class Twin:
         """[n, J] joint states of every scan: radians, or lengths in the units of the scans."""
         return torch.cat([scan.prediction.joint_state for scan in self.scans]).numpy()
 
-    def export(self, folder: Path, names: Sequence[str], scan: int = 0, formats: Sequence[str] | None = None) -> list:
+    def export(
+        self,
+        folder: str | os.PathLike,
+        names: Sequence[str],
+        scan: int = 0,
+        formats: Sequence[str] | None = None,
+    ) -> list[Path]:
         """Write the object as one scan shows it (`ScanPrediction.export`), and `states.json`, the states of all.
 
         Args:
             folder: Is made if missing.
-            names: What the scans are called.
+            names: What the scans are called, each otherwise.
             scan: The one that is exported.
             formats: As `ScanPrediction.export`.
 
         Returns:
             The files written.
+
+        Raises:
+            ExportError: if two scans have one name, or if a format is unknown or needs a package that is not installed.
+            ValueError: if there is not one name for each scan.
+            OSError: if a file cannot be written.
         """
-        files = self.scans[scan].export(folder, formats)
+        folder, repeated = Path(folder), [name for name, times in Counter(names).items() if times > 1]
+        if repeated:
+            raise ExportError(
+                f"{len(names)} scans, of which several are called {', '.join(repeated)}: {STATES_FILE} could hold the "
+                "state of one of them only; give each a name of its own"
+            )
         content = {
             name: {"state": one.prediction.joint_state[0].tolist(), "base_pose": one.prediction.base_pose[0].tolist()}
             for name, one in zip(names, self.scans, strict=True)
         }
+        files = self.scans[scan].export(folder, formats)
         file = folder / STATES_FILE
         with atomic_write(file) as opened:
             opened.write((json.dumps(content, indent=2) + "\n").encode())

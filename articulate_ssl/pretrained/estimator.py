@@ -23,6 +23,7 @@ from typing_extensions import Self
 
 from articulate_ssl.geometry.orientation_range import OrientationRange
 from articulate_ssl.inference.checkpoint_file import CheckpointError
+from articulate_ssl.inference.device import usable_device
 from articulate_ssl.inference.prediction import ScanEstimate
 from articulate_ssl.inference.scan_prediction import ScanPrediction, in_scan_frame
 from articulate_ssl.ops.denormals import flush_denormals
@@ -30,7 +31,7 @@ from articulate_ssl.pretrained.ranking import ranked
 from articulate_ssl.training.checkpoint import load_module
 from articulate_ssl.training.shipped_weights import ShippedWeights, find_weights, shipped_as, shipped_weights
 from articulate_ssl.training.weights_card import CARD_SUFFIX, WeightsCard
-from datamodules.point_cloud_io import load_point_cloud, usable_scan
+from datamodules.point_cloud_io import PointCloudError, load_point_cloud, usable_scan
 
 AUTO = "auto"  # every shipped category
 
@@ -105,7 +106,11 @@ class Estimator(ABC):
 
     @abstractmethod
     def to(self, device: str | torch.device) -> Self:
-        """Move to a device."""
+        """Move to a device.
+
+        Raises:
+            DeviceError: if PyTorch cannot compute there.
+        """
 
 
 class ArticulatedPoseEstimator(Estimator):
@@ -116,6 +121,9 @@ class ArticulatedPoseEstimator(Estimator):
         weights: Name or path of the weights, for messages and results.
         card: What is known about them.
         device: Where to compute.
+
+    Raises:
+        DeviceError: if PyTorch cannot compute there.
 
     Attributes:
         module: The trained module; for most it is an `ArticulatedPoseModule`.
@@ -131,13 +139,12 @@ class ArticulatedPoseEstimator(Estimator):
         device: str | torch.device = "cpu",
     ) -> None:
         self.weights, self.card, self.category = weights, card, module.category
-        self.estimators = (self,)
-        self.device = torch.device(device)
-        self.module = module.to(self.device)
+        self.estimators, self.module = (self,), module
+        self.to(device)
 
     def predict_batch(self, clouds: Iterable[Cloud], refine: bool | None = None) -> list[ScanPrediction]:
         """See `Estimator.predict_batch`."""
-        read = [as_cloud(cloud) for cloud in clouds]
+        read = _as_clouds(clouds)
         with flush_denormals():
             estimates = self.module.predict_clouds(read, refine)
         about = self.module.state_range, self.category, self.weights, self.module.orientation.limited
@@ -145,7 +152,7 @@ class ArticulatedPoseEstimator(Estimator):
 
     def to(self, device: str | torch.device) -> Self:
         """Move to a device."""
-        self.device = torch.device(device)
+        self.device = usable_device(device)
         self.module = self.module.to(self.device)
         return self
 
@@ -175,13 +182,13 @@ class EstimatorChoice(Estimator):
         return self._compare_batch([points], refine)[0]
 
     def _compare_batch(self, clouds: Iterable[Cloud], refine: bool | None) -> list[list[ScanPrediction]]:
-        read = [as_cloud(cloud) for cloud in clouds]
+        read = _as_clouds(clouds)
         answers = [estimator.predict_batch(read, refine) for estimator in self.estimators]
         return [ranked(candidates) for candidates in zip(*answers, strict=True)]
 
     def to(self, device: str | torch.device) -> Self:
         """Move all to a device."""
-        self.device = torch.device(device)
+        self.device = usable_device(device)
         for estimator in self.estimators:
             estimator.to(device)
         return self
@@ -204,34 +211,65 @@ def load(
             or a repository on the Hugging Face hub ("owner/name"); only the last needs a network.
         view: `complete` (any orientation) or `depth` (views of an upright camera) of shipped categories; None takes
             for every scan the one that explains it better.
-        device: Where to compute.
+        device: Where to compute: "cpu", "cuda" or "cuda:<index>".
 
     Returns:
         An `EstimatorChoice` where several sets of shipped weights are meant, else an `ArticulatedPoseEstimator`.
 
     Raises:
-        CheckpointError: if there are no such weights, or they do not fit this version of the code.
+        CheckpointError: if there are no such weights, they do not fit this version of the code, or a view is chosen of
+            weights that do not come with the package.
+        DeviceError: if PyTorch cannot compute on the device.
     """
+    device = usable_device(device)
     shipped = _every_category(view) if str(name_or_path) == AUTO else shipped_as(str(name_or_path), view)
     estimators = [_estimator(weights.file, weights.name, device) for weights in shipped]
     if len(estimators) > 1:
         return EstimatorChoice(estimators, AUTO if str(name_or_path) == AUTO else shipped[0].category)
+    if not estimators and view is not None:
+        raise CheckpointError(
+            f"{name_or_path}: view={view!r} chooses among the weights that come with the package, and this is none of "
+            "them; leave it out"
+        )
     return estimators[0] if estimators else _estimator(find_weights(name_or_path), str(name_or_path), device)
 
 
-def as_cloud(points: Cloud) -> np.ndarray:  # [N, 3] float64
-    """Points of any kind, checked, without far outliers (`datamodules.point_cloud_io`).
+def as_cloud(
+    points: Cloud,
+    name: str = "the points",  # for messages, where they are no file
+) -> np.ndarray:  # [N, 3] float64
+    """Points of any kind, checked, without what is no part of the object (`datamodules.point_cloud_io`).
 
     Raises:
         PointCloudError: if they are no usable cloud.
     """
     if isinstance(points, str | os.PathLike):
         return load_point_cloud(points)
-    values = points.detach().cpu().numpy() if isinstance(points, Tensor) else np.asarray(points)
-    scan = usable_scan("the points", values)
+    try:
+        values = _as_array(points)
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise PointCloudError(
+            f"{name}: no array of numbers of shape [N, 3] ({str(error).splitlines()[0]}); give a dense array or tensor"
+        ) from error
+    scan = usable_scan(name, values)
     for note in scan.notes:
-        logger.warning("the points: %s", note)
+        logger.warning("%s: %s", name, note)
     return scan.points
+
+
+def _as_array(points: np.ndarray | Tensor) -> np.ndarray:
+    if not isinstance(points, Tensor):
+        return np.asarray(points)
+    here = points.detach().cpu()
+    return (here.double() if here.is_floating_point() else here).numpy()  # numpy knows fewer types than PyTorch
+
+
+def _as_clouds(clouds: Iterable[Cloud]) -> list[np.ndarray]:
+    """As `as_cloud`; of several, messages say which."""
+    clouds = list(clouds)
+    if len(clouds) == 1:
+        return [as_cloud(clouds[0])]
+    return [as_cloud(cloud, f"clouds[{i}] of the batch") for i, cloud in enumerate(clouds)]
 
 
 def _every_category(view: str | None) -> tuple[ShippedWeights, ...]:
@@ -244,7 +282,6 @@ def _every_category(view: str | None) -> tuple[ShippedWeights, ...]:
 
 
 def _estimator(file: Path, weights: str, device: str | torch.device) -> ArticulatedPoseEstimator:
-    card = file.with_suffix(CARD_SUFFIX)
-    return ArticulatedPoseEstimator(
-        load_module(file), weights, WeightsCard.load(card) if card.is_file() else None, device
-    )
+    module, card = load_module(file), file.with_suffix(CARD_SUFFIX)
+    module.card = WeightsCard.load(card) if card.is_file() else None
+    return ArticulatedPoseEstimator(module, weights, module.card, device)

@@ -34,18 +34,18 @@ def load_module(path: str | os.PathLike) -> ArticulatedPoseModule:
         CheckpointError: if the file is missing, damaged, foreign, or does not fit this version of the code.
     """
     content = (read_weights if Path(path).suffix == SUFFIX else read_checkpoint)(path)
-    plain = dict(content["hyper_parameters"])
     try:
+        plain = dict(content["hyper_parameters"])
         arguments = {name: _GROUPS[name](**value) if name in _GROUPS else value for name, value in plain.items()}
         module = ArticulatedPoseModule(**arguments)
         _load_state(module, content["state_dict"])
-    except (TypeError, ValueError, RuntimeError) as error:
-        problem = str(error).splitlines()[0]
+        module.on_load_checkpoint(content)
+    except (TypeError, ValueError, RuntimeError, LookupError, AttributeError) as error:
+        problem = (str(error).splitlines() or [type(error).__name__])[0]
         raise CheckpointError(
             f"{path}: does not fit this version of articulate-ssl ({problem}); "
             "train again, or use the version it was made with"
         ) from error
-    module.on_load_checkpoint(content)
     return module.eval()
 
 

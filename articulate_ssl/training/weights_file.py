@@ -74,9 +74,15 @@ def read_weights(path: str | os.PathLike) -> dict[str, Any]:
             f"{path}: weights of another project (no metadata {CHECKPOINT_KEY}); "
             "use a file that `save_pretrained` or `articulate-ssl weights pack` wrote"
         )
-    about = json.loads(metadata[CHECKPOINT_KEY])
+    try:
+        about = dict(json.loads(metadata[CHECKPOINT_KEY]))
+        hyper_parameters = about.pop("hyper_parameters")
+    except (ValueError, TypeError, KeyError) as error:
+        raise CheckpointError(
+            f"{path}: damaged, its metadata {CHECKPOINT_KEY} are no JSON of ours ({error!r}); copy it again"
+        ) from error
     return {
         "state_dict": {k: v.float() if v.dtype == torch.float16 else v for k, v in tensors.items()},
-        "hyper_parameters": about.pop("hyper_parameters"),
+        "hyper_parameters": hyper_parameters,
         CHECKPOINT_KEY: about | {"recipe": None},
     }

@@ -8,7 +8,14 @@ import open3d
 import pytest
 import trimesh
 
-from datamodules.point_cloud_io import MESH_SAMPLES, MIN_POINTS, PointCloudError, load_point_cloud, read_scan
+from datamodules.point_cloud_io import (
+    MESH_SAMPLES,
+    MIN_POINTS,
+    PointCloudError,
+    load_point_cloud,
+    read_scan,
+    usable_scan,
+)
 
 
 @pytest.fixture
@@ -38,6 +45,15 @@ def test_every_format_is_read_in_order(tmp_path, cloud, suffix):
     loaded = load_point_cloud(path)
     assert loaded.shape == cloud.shape
     np.testing.assert_allclose(loaded, cloud, rtol=1e-6, atol=1e-5)
+
+
+@pytest.mark.parametrize("ascii_rows", [True, False])
+@pytest.mark.parametrize("compressed", [True, False])
+def test_a_pcd_of_double_precision_is_read_in_it(tmp_path, cloud, ascii_rows, compressed):
+    cloud += [500000, 5400000, 300]
+    tensors = open3d.t.geometry.PointCloud(open3d.core.Tensor(cloud))
+    open3d.t.io.write_point_cloud(str(tmp_path / "scan.pcd"), tensors, write_ascii=ascii_rows, compressed=compressed)
+    np.testing.assert_allclose(load_point_cloud(tmp_path / "scan.pcd"), cloud, rtol=0, atol=1e-3)
 
 
 def test_integer_and_float32_clouds_are_numbers_too(tmp_path, cloud):
@@ -100,6 +116,63 @@ def test_a_truncated_file_is_refused(tmp_path, cloud, suffix):
     path.write_bytes(path.read_bytes()[:-1000])
     with pytest.raises(PointCloudError, match="damaged"):
         load_point_cloud(path)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "head"),
+    [
+        ("pcd", "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 300\nHEIGHT 1\nPOINTS 300\nDATA ascii\n"),
+        ("ply", "ply\nformat ascii 1.0\nelement vertex 300\n{}end_header\n".format("property float {}\n" * 3)),
+    ],
+)
+def test_text_that_ends_too_early_is_refused(tmp_path, cloud, suffix, head):
+    path = tmp_path / f"scan.{suffix}"
+    rows = [" ".join(map(str, point)) + "\n" for point in cloud.tolist()]
+    path.write_text(head.format(*"xyz") + "".join(rows))
+    assert len(load_point_cloud(path)) == 300
+    for end in ("", " ".join(rows[200].split()[:2])):
+        path.write_text(head.format(*"xyz") + "".join(rows[:200]) + end)
+        with pytest.raises(PointCloudError, match=rf"scan\.{suffix}: damaged.* 20[01] of 300"):
+            load_point_cloud(path)
+
+
+def test_a_mesh_in_text_that_lacks_faces_is_refused(tmp_path):
+    path = tmp_path / "mesh.ply"
+    path.write_bytes(trimesh.creation.icosphere().export(file_type="ply", encoding="ascii"))
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-99]))
+    with pytest.raises(PointCloudError, match=r"cut off: 1823 of 1922 rows"):
+        load_point_cloud(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [(b"(300, 3)", b"(300, 3"), (b"(300, 3), }        ", b"(99999999999, 3), }"), (b"'descr'", b"'des\xff'")],
+)
+def test_a_damaged_numpy_header_is_refused(tmp_path, cloud, old, new):
+    np.save(tmp_path / "scan.npy", cloud)
+    content = (tmp_path / "scan.npy").read_bytes()
+    assert old in content
+    (tmp_path / "scan.npy").write_bytes(content.replace(old, new))
+    with pytest.raises(PointCloudError, match="damaged"):
+        load_point_cloud(tmp_path / "scan.npy")
+
+
+def test_a_pcd_of_unknown_types_is_refused(tmp_path, cloud):
+    write(tmp_path / "scan.pcd", cloud)
+    content = (tmp_path / "scan.pcd").read_bytes()
+    (tmp_path / "scan.pcd").write_bytes(content.replace(b"TYPE F F F", b"TYPE F Q F"))
+    with pytest.raises(PointCloudError, match=r"scan\.pcd: damaged, or of types"):
+        load_point_cloud(tmp_path / "scan.pcd")
+
+
+def test_a_damaged_archive_is_refused_wherever_it_is_damaged(tmp_path, cloud):
+    np.savez_compressed(tmp_path / "scan.npz", points=cloud)
+    content = (tmp_path / "scan.npz").read_bytes()
+    method = content.index(b"PK\x01\x02") + 10  # of compression, in the table of contents
+    for place in (len(content) // 2, method, method + 6):
+        (tmp_path / "scan.npz").write_bytes(content[:place] + b"\x63" + content[place + 1 :])
+        with pytest.raises(PointCloudError, match="damaged"):
+            load_point_cloud(tmp_path / "scan.npz")
 
 
 class Trap:
@@ -191,8 +264,32 @@ def test_points_that_stand_off_within_reason_stay(tmp_path, cloud):
     assert len(scan.points) == 301 and scan.notes == ()
 
 
-def test_a_cloud_of_which_too_little_is_left_is_refused(tmp_path, cloud):
-    """Almost all points coincide: whatever is anywhere else is far from them."""
-    np.save(tmp_path / "scan.npy", np.where(np.arange(300)[:, None] < 290, 1.0, cloud))
-    with pytest.raises(PointCloudError, match="coincide"):
-        load_point_cloud(tmp_path / "scan.npy")
+def test_a_cloud_of_which_too_little_is_left_is_refused(cloud):
+    far = np.concatenate([cloud[:120], 1e6 + cloud[120:132]])
+    with pytest.raises(PointCloudError, match=r"12 of 132 points left out as outliers.*holds 120 points"):
+        usable_scan("scan", far)
+
+
+@pytest.mark.parametrize("place", [(0, 0, 0), (1.5, -2, 900)])
+def test_pixels_without_depth_are_left_out_and_counted(cloud, place):
+    """A camera has them at its origin, which a user may have moved."""
+    scan = usable_scan("scan", np.concatenate([cloud[:50], np.tile(np.array(place), (20, 1)), cloud[50:]]))
+    np.testing.assert_array_equal(scan.points, cloud)
+    (note,) = scan.notes
+    assert "20 of 320 points left out as pixels without depth" in note
+    assert "exactly ({:g}, {:g}, {:g})".format(*place) in note
+
+
+def test_clouds_that_repeat_points_as_they_come_stay_as_they_are(cloud):
+    """Quantised to a few places, drawn with replacement, padded from the beginning, or with one pixel at the origin."""
+    drawn = cloud[np.random.default_rng(0).integers(300, size=4096)]
+    solid = np.random.default_rng(0).integers(-3, 4, (4096, 3))
+    for points in (solid, (drawn / 20).round(), drawn, np.resize(cloud, (450, 3)), np.vstack([cloud, np.zeros(3)])):
+        scan = usable_scan("scan", points)
+        np.testing.assert_array_equal(scan.points, points)
+        assert scan.notes == ()
+
+
+def test_few_points_do_not_become_many_by_repetition(cloud):
+    with pytest.raises(PointCloudError, match=r"scan: its 400 points lie at 100 different places, at least 128"):
+        usable_scan("scan", np.repeat(cloud[:100], 4, axis=0))

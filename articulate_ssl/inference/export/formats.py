@@ -1,15 +1,18 @@
-"""The names of what `folder` can write, and which of them this machine can: nothing else is imported for that."""
+"""The names of what `folder` can write, which of it this machine can, and where: nothing else is imported for that."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from importlib.util import find_spec
+from pathlib import Path
 from typing import NamedTuple
 
 # The JSON stays last: where it is new, the rest is.
 FORMATS = ("clouds", "urdf", "mjcf", "glb", "usd", "picture", "gif", "arrays", "json")
 # Written only where asked for by name, because they take seconds.
 ON_REQUEST = ("gif",)
+MODELS = ("urdf", "mjcf")  # what the physics check reads
 
 
 class Extra(NamedTuple):
@@ -28,7 +31,7 @@ EXTRAS = {"usd": Extra("pxr", "usd")}
 
 
 class ExportError(ValueError):
-    """A format is unknown, or needs a package that is not installed; the message says what to do."""
+    """What is asked for cannot be written, or not there; the message says what to do."""
 
 
 def chosen_formats(names: Sequence[str] | None = None) -> tuple[str, ...]:
@@ -50,6 +53,20 @@ def chosen_formats(names: Sequence[str] | None = None) -> tuple[str, ...]:
                 f"pip install 'articulate-ssl[{extra.name}]'"
             )
     return tuple(name for name in FORMATS if name in names)
+
+
+def demand_folder(folder: Path) -> None:
+    """Refuse a folder that can neither be written into nor made, before work is done for it; it is not made here.
+
+    Raises:
+        ExportError: naming the folder.
+    """
+    wanted = folder.absolute()
+    there = next(path for path in (wanted, *wanted.parents) if path.exists())
+    if not there.is_dir():
+        raise ExportError(f"{folder}: no folder for results, as {there} is a file; name another folder")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise ExportError(f"{folder}: no folder for results, as {there} may not be written into; name another folder")
 
 
 def _installed(name: str) -> bool:

@@ -52,7 +52,8 @@ def _model(thing: RigidObject) -> etree._Element:
     for link in thing.links:
         etree.SubElement(assets, "mesh", name=link.name, file=f"{link.name}.stl")
     quaternion = Rotation.from_matrix(thing.pose[:3, :3]).as_quat(scalar_first=True)
-    where = {"pos": numbers(thing.pose[:3, 3]), "quat": numbers(quaternion)}
+    # The scan may be far from its origin (in metres of a map), while all other lengths are of the object's size.
+    where = {"pos": numbers(thing.pose[:3, 3], digits=15), "quat": numbers(quaternion)}
     visited = _add_body(etree.SubElement(model, "worldbody"), thing, thing.root, where)
     if thing.joints:
         contact = etree.SubElement(model, "contact")

@@ -9,7 +9,8 @@ It needs mujoco (the extra `mujoco`), which is imported when something is checke
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import trimesh
+from lxml import etree
 
 from articulate_ssl.inference.export.rigid_links import MESH_FOLDER
 
@@ -168,8 +170,12 @@ class PhysicsVerdict:
         return [f"{verdict}; {unit}", *(line for file in self.files for line in file.lines())]
 
 
-def check(folder: Path, metres_per_unit: float | None = None) -> PhysicsVerdict:
-    """Try the `MODEL_FILES` that are in a folder of exports.
+def check(
+    folder: str | os.PathLike,
+    metres_per_unit: float | None = None,
+    names: Sequence[str] = MODEL_FILES,
+) -> PhysicsVerdict:
+    """Try the models that are in a folder of exports.
 
     Each is dropped on a plane with its joints free, then held by its base while every joint is pulled through its range
     and against both its limits.
@@ -177,13 +183,15 @@ def check(folder: Path, metres_per_unit: float | None = None) -> PhysicsVerdict:
     Args:
         folder: Where `urdf.write` or `mjcf.write` wrote.
         metres_per_unit: Size of the scan's unit (.001 for millimetres); None makes the object `ASSUMED_SIZE` large.
+        names: Of `MODEL_FILES`, those that are tried where they are there.
 
     Raises:
         PhysicsCheckError: if mujoco is not installed, the folder holds nothing to check, or the unit is not positive.
     """
     _demand_mujoco()
-    files = [folder / name for name in MODEL_FILES if (folder / name).is_file()]
-    meshes = sorted((folder / MESH_FOLDER).glob("*.stl"))
+    folder = Path(folder)
+    files = [folder / name for name in MODEL_FILES if name in names and (folder / name).is_file()]
+    meshes = sorted({mesh for file in files for mesh in _meshes(file)})
     if not files or not meshes:
         raise PhysicsCheckError(
             f"{folder}: holds no {' or '.join(MODEL_FILES)} with its {MESH_FOLDER}; export urdf or mjcf there first"
@@ -194,6 +202,17 @@ def check(folder: Path, metres_per_unit: float | None = None) -> PhysicsVerdict:
         raise PhysicsCheckError(f"metres per unit must be a positive number, got {metres_per_unit}")
     verdicts = tuple(_check_file(file, scale, scale * size) for file in files)
     return PhysicsVerdict(scale, metres_per_unit is None, verdicts)
+
+
+def _meshes(model: Path) -> list[Path]:
+    """The files of meshes that a model names and that are there: the folder may hold those of another object, too."""
+    try:
+        root = etree.parse(model)
+    except etree.XMLSyntaxError:  # MuJoCo says what is wrong with it
+        return []
+    named = [mesh.get("file") or mesh.get("filename") for mesh in root.iter("mesh")]
+    files = [model.parent / MESH_FOLDER / Path(name).name for name in named if name]
+    return [file for file in files if file.is_file()]
 
 
 def _demand_mujoco() -> None:

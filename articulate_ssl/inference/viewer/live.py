@@ -7,6 +7,7 @@ single precision: a node at `position` stands at `position * scene.scale + scene
 from __future__ import annotations
 
 import io
+import socket
 from contextlib import redirect_stdout
 from threading import RLock
 from types import TracebackType
@@ -22,6 +23,7 @@ from articulate_ssl.inference.scan_prediction import ScanPrediction
 from articulate_ssl.inference.viewer.scene import Hypothesis, Scene, scene_of
 
 HOST = "127.0.0.1"
+LAST_PORT = 65535
 # Steps of a slider from end to end, at least: finer than a mouse.
 SLIDER_STEPS = 1000
 # In display units, chosen by eye.
@@ -40,6 +42,9 @@ class LiveViewer:
         result: What to show.
         port: To listen on, at this machine's own address only; 0 takes a free one, and one that is taken the next.
 
+    Raises:
+        OSError: if neither this port nor any above it is free.
+
     Attributes:
         scene: What is shown.
         hypothesis: Which of `scene.hypotheses` is shown now.
@@ -52,7 +57,7 @@ class LiveViewer:
     def __init__(self, result: ScanPrediction, port: int = 8080) -> None:
         self.scene: Scene = scene_of(result)
         with redirect_stdout(io.StringIO()):  # viser's banner: who starts this says where it is in words of its own
-            self._server = viser.ViserServer(host=HOST, port=port, label="articulate-ssl", verbose=False)
+            self._server = viser.ViserServer(host=HOST, port=_free_port(port), label="articulate-ssl", verbose=False)
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
         self._server.scene.configure_environment_map(environment_intensity=LIGHT)
         self._place_camera()
@@ -199,6 +204,19 @@ class LiveViewer:
         for name, nodes in zip(self._shows, ([self._cloud], self.part_nodes, self.axis_nodes), strict=True):
             for node in nodes:
                 node.visible = self._shows[name].value
+
+
+def _free_port(wanted: int) -> int:
+    """The first free port from one on; 0 stays. viser waits for ever behind the last."""
+    for port in range(wanted, LAST_PORT + 1):
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as viser does: a port that was just left
+            try:
+                probe.bind((HOST, port))
+            except OSError:
+                continue
+            return port
+    raise OSError(f"no port from {wanted} to {LAST_PORT} is free at {HOST}; take a lower one, or 0 for any")
 
 
 def _shown_state(joint: RigidJoint, state: float) -> float:

@@ -1,5 +1,6 @@
 import argparse
 import json
+import os
 import re
 
 import numpy as np
@@ -161,11 +162,21 @@ def test_bad_checkpoints_exit_2(scan_folder, module, capsys):
     assert not (scan_folder / "scan-prediction").exists()
 
 
-def test_a_folder_that_is_a_file_exits_2(scan_folder, module, capsys):
-    assert_refused(capsys, ["scan.npy", "--ckpt", "laptop.ckpt", "--out", "laptop.ckpt"], "laptop.ckpt")
+@pytest.mark.parametrize("out", ["laptop.ckpt", "laptop.ckpt/results"])
+def test_a_folder_that_is_a_file_exits_2_before_anything_is_predicted(scan_folder, module, capsys, out):
+    module.predict_clouds = None
+    words = ["scan.npy", "--ckpt", "laptop.ckpt", "--out", out]
+    assert_refused(capsys, words, rf"{out}: no folder .*laptop\.ckpt is a file; name another")
 
 
-@pytest.mark.parametrize("device", ["toaster", "cuda:99"])
+def test_a_folder_that_may_not_be_written_into_exits_2(scan_folder, module, capsys, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may write everywhere
+    words = ["scan.npy", "--ckpt", "laptop.ckpt", "--out", "new/results"]
+    assert_refused(capsys, words, rf"new/results: .*{scan_folder} may not be written into")
+    assert not (scan_folder / "new").exists()
+
+
+@pytest.mark.parametrize("device", ["toaster", "cuda:99", "hpu"])
 def test_a_device_that_is_not_there_exits_2(scan_folder, module, capsys, device):
     with pytest.raises(SystemExit) as stop:
         predict("scan.npy", "--ckpt", "laptop.ckpt", "--device", device)
@@ -214,6 +225,11 @@ def test_auto_tries_every_category_and_says_how_sure_it_is(scan_folder, package,
         (["--category", "toaster"], "invalid choice: 'toaster'"),
         (["--ckpt", "laptop.ckpt", "--view", "depth"], "--view chooses among the weights of the package"),
         (["--category", "laptop", "--formats", "json,fax"], "no export is called fax"),
+        (["--category", "laptop", "--formats", ""], "nothing would be written; name some of clouds"),
+        (["--category", "laptop", "--formats", "json", "--check"], "--check reads urdf or mjcf"),
+        (["--category", "laptop", "--metres-per-unit", "1"], "--metres-per-unit is for --check"),
+        (["--category", "laptop", "--check", "--metres-per-unit", "-1"], "'-1' is no length"),
+        (["--category", "laptop", "--check", "--metres-per-unit", "nan"], "'nan' is no length"),
     ],
 )
 def test_arguments_that_contradict_each_other_exit_2(scan_folder, package, capsys, words, problem):
@@ -240,8 +256,10 @@ def test_a_check_prints_what_mujoco_found(scan_folder, module, capsys):
     assert predict("scan.npy", "--ckpt", "laptop.ckpt", "--formats", "mjcf", "--check") == 0
     out = capsys.readouterr().out
     assert "physics check" in out and "object.xml: loads" in out
-    assert predict("scan.npy", "--ckpt", "laptop.ckpt", "--formats", "clouds", "--out", "clouds", "--check") == 2
-    assert "export urdf or mjcf there first" in capsys.readouterr().err
+    # The folder holds the model now; what is written there next is checked alone.
+    assert predict("scan.npy", "--ckpt", "laptop.ckpt", "--formats", "urdf", "--check") == 0
+    out = capsys.readouterr().out
+    assert "object.urdf: loads" in out and "object.xml" not in out
 
 
 def assert_refused(capsys, arguments, pattern) -> None:

@@ -30,6 +30,31 @@ def test_scans_become_a_folder(scan_files, tmp_path, capsys):
     assert list(json.loads((tmp_path / "twin" / "states.json").read_text())) == scan_files
 
 
+def test_scans_of_one_name_are_told_apart_by_their_folders(scan_files, tmp_path, capsys, monkeypatch):
+    given = []
+    monkeypatch.setattr(twin.Twin, "export", lambda self, folder, names: given.extend(names) or [])
+    paths = [f"state{i}/scan.npy" for i in range(8)]
+    for name, path in zip(scan_files, paths, strict=True):
+        (tmp_path / path).parent.mkdir()
+        (tmp_path / name).rename(tmp_path / path)
+    assert main(["twin", *paths, "--parts", "2", "--joint", "prismatic"]) == 0
+    assert given == paths
+    out = capsys.readouterr().out
+    assert all(path in out for path in paths)
+
+
+def test_a_scan_that_is_given_twice_is_refused(scan_files, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(["twin", *scan_files, "./3.npy", "--parts", "2"])
+    assert "3.npy: given more than once" in capsys.readouterr().err
+
+
+def test_a_folder_that_is_a_file_is_refused_first(scan_files, capsys, monkeypatch):
+    monkeypatch.setattr(twin, "find_one_object", None)
+    assert main(["twin", *scan_files, "--parts", "2", "--out", "0.npy"]) == 2
+    assert "0.npy is a file; name another folder" in capsys.readouterr().err
+
+
 def test_too_few_scans_are_refused(scan_files, tmp_path, capsys, monkeypatch):
     monkeypatch.undo()
     monkeypatch.chdir(tmp_path)

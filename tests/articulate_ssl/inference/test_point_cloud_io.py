@@ -1,8 +1,9 @@
 import numpy as np
+import open3d
 import pytest
 import trimesh
 
-from articulate_ssl.inference.point_cloud_io import normalise_cloud, save_coloured_ply
+from articulate_ssl.inference.point_cloud_io import load_point_cloud, normalise_cloud, save_coloured_ply
 
 
 @pytest.fixture
@@ -14,9 +15,18 @@ def test_coloured_ply_round_trip(tmp_path, cloud):
     colours = np.random.default_rng(1).integers(0, 256, cloud.shape, dtype=np.uint8)
     save_coloured_ply(tmp_path / "c.ply", cloud, colours)
     loaded = trimesh.load(tmp_path / "c.ply")
-    np.testing.assert_allclose(loaded.vertices, cloud, rtol=1e-6, atol=1e-5)
+    np.testing.assert_array_equal(loaded.vertices, cloud)
     np.testing.assert_array_equal(loaded.colors[:, :3], colours)
     assert [p.name for p in tmp_path.iterdir()] == ["c.ply"]
+
+
+def test_a_scan_in_metres_of_a_map_keeps_its_points_in_every_reader(tmp_path, cloud):
+    far = cloud / 400 + [500000, 5400000, 300]
+    save_coloured_ply(tmp_path / "c.ply", far, np.full(cloud.shape, 51, dtype=np.uint8))
+    by_open3d = open3d.io.read_point_cloud(str(tmp_path / "c.ply"))
+    for points in (trimesh.load(tmp_path / "c.ply").vertices, by_open3d.points, load_point_cloud(tmp_path / "c.ply")):
+        np.testing.assert_array_equal(points, far)
+    np.testing.assert_allclose(by_open3d.colors, 0.2)
 
 
 def test_normalisation_of_an_observed_cloud(cloud):

@@ -60,11 +60,18 @@ def test_limits_hold_every_state(world):
 
 def test_the_export_holds_the_states_of_all_scans(world, tmp_path):
     twin, names = world[1], [f"{i}.ply" for i in range(8)]
-    files = twin.export(tmp_path / "out", names, formats=["json", "urdf"])
+    files = twin.export(str(tmp_path / "out"), names, formats=["json", "urdf"])
     states = json.loads((tmp_path / "out" / "states.json").read_text())
     assert tmp_path / "out" / "states.json" in files and tmp_path / "out" / "object.urdf" in files
     assert list(states) == names
     np.testing.assert_allclose([states[name]["state"] for name in names], twin.states)
+
+
+@pytest.mark.parametrize(("names", "error"), [(["a", "b"] * 4, "called a, b"), (["a"], "shorter|longer")])
+def test_names_that_do_not_tell_the_scans_apart_are_refused_before_anything_is_written(world, tmp_path, names, error):
+    with pytest.raises(ValueError, match=error):
+        world[1].export(tmp_path / "out", names, formats=["json"])
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(("parts", "joint", "message"), [(2, "ball", "joint must be"), (1, "revolute", "at least 2")])

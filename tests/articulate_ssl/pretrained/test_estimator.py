@@ -13,9 +13,11 @@ import articulate_ssl
 from articulate_ssl import ArticulatedPoseEstimator, ArticulatedPoseModule, ScanPrediction, load
 from articulate_ssl.inference import scan_scales
 from articulate_ssl.inference.checkpoint_file import CheckpointError
+from articulate_ssl.inference.device import DeviceError
 from articulate_ssl.inference.pose_estimation import PoseEstimator
-from articulate_ssl.pretrained.estimator import EstimatorChoice
+from articulate_ssl.pretrained.estimator import EstimatorChoice, as_cloud
 from articulate_ssl.training import shipped_weights
+from articulate_ssl.training.weights_card import WeightsCard
 from articulate_ssl.training.weights_file import write_weights
 from datamodules.point_cloud_io import PointCloudError
 from datamodules.shards import read_shard
@@ -116,6 +118,54 @@ def test_refinement_can_be_left_out(folder, cloud):
 def test_bad_points_are_refused(folder, points, problem):
     with pytest.raises(PointCloudError, match=f"the points: .*{problem}"):
         load(folder / "trained.ckpt").predict(points)
+
+
+@pytest.mark.parametrize(
+    "points",
+    [[[1, 2, 3], [4, 5]] * 100, torch.ones(300, 3).to_sparse(), torch.ones(300, 3, dtype=torch.complex64), None],
+    ids=["ragged", "sparse", "complex", "none"],
+)
+def test_what_is_no_array_is_refused(points):
+    with pytest.raises(PointCloudError, match=r"^the points: .*\[N, 3\]"):
+        as_cloud(points)
+
+
+@pytest.mark.parametrize("kind", [torch.bfloat16, torch.float16, torch.float32, torch.int32])
+def test_tensors_of_any_numbers_are_clouds(cloud, kind):
+    points = torch.from_numpy(cloud * 50).to(kind)
+    np.testing.assert_array_equal(as_cloud(points), points.double())
+
+
+def test_of_a_batch_the_cloud_that_is_bad_is_named(folder, cloud):
+    for estimator in (load(folder / "trained.ckpt"), load("laptop")):
+        with pytest.raises(PointCloudError, match=r"^clouds\[1\] of the batch: .*at least 128"):
+            estimator.predict_batch([cloud, cloud[:5], cloud])
+
+
+@pytest.mark.parametrize("name", ["trained.ckpt", "somebody/laptop"])
+def test_a_view_of_what_does_not_come_with_the_package_is_refused(folder, name):
+    with pytest.raises(CheckpointError, match=rf"{name}: view='depth' .*leave it out"):
+        load(folder / name if name.endswith("ckpt") else name, view="depth")
+
+
+def test_the_module_of_an_estimator_is_saved_with_its_card(folder, tmp_path):
+    (tmp_path / "oven.safetensors").write_bytes((folder / "weights" / "oven-complete.safetensors").read_bytes())
+    data = {"command": "make data", "seed": 1, "train_instances": 3, "test_instances": 2}
+    training = {"command": "lightning fit", "seed": 0, "steps": 8, "commit": "abc"}
+    tested = {"samples": 16, "instances": 2}
+    card = WeightsCard("oven", "complete", ["body", "door"], data, training, tested, ["none"], "2026-01-02")
+    card.save(tmp_path / "oven.json")
+    load(tmp_path / "oven.safetensors").module.save_pretrained(tmp_path / "mine")
+    assert load(tmp_path / "mine").card == card
+
+
+@pytest.mark.parametrize("device", ["foo", "cuda:99", "hpu", "meta"])
+def test_a_device_that_cannot_compute_is_refused(folder, device):
+    estimator = load("laptop")
+    for ask in (lambda: load("laptop", device=device), lambda: estimator.to(device)):
+        with pytest.raises(DeviceError, match=rf"'{device}' is no device .*use cpu"):
+            ask()
+    assert estimator.device == torch.device("cpu")
 
 
 def test_names_lead_to_one_or_several_sets_of_weights(folder):

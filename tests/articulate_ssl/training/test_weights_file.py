@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 from synthetic import write_synthetic_set
 from tiny import POINTS, fit, tiny_module
 
-from articulate_ssl.inference.checkpoint_file import CheckpointError
+from articulate_ssl.inference.checkpoint_file import CHECKPOINT_KEY, CheckpointError
 from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.training import shipped_weights
 from articulate_ssl.training.checkpoint import load_module
@@ -119,6 +119,29 @@ def test_damaged_and_foreign_weights_are_refused(trained, tmp_path):
     for name, problem in (("none", "no such file"), ("cut", "damaged"), ("foreign", "another project")):
         with pytest.raises(CheckpointError, match=rf"{name}\.safetensors: .*{problem}"):
             read_weights(tmp_path / f"{name}.safetensors")
+
+
+@pytest.mark.parametrize("metadata", ["{}", "no JSON", "[]", "3"])
+def test_damaged_metadata_are_refused(tmp_path, metadata):
+    save_file({"weight": torch.ones(2)}, tmp_path / "x.safetensors", {CHECKPOINT_KEY: metadata})
+    with pytest.raises(CheckpointError, match=r"x\.safetensors: damaged, its metadata.*copy it again"):
+        load_module(tmp_path / "x.safetensors")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"hyper_parameters": 3},
+        {"hyper_parameters": {"network": 3}},
+        {"state_dict": []},
+        {CHECKPOINT_KEY: 1},
+        {CHECKPOINT_KEY: {"version": 2}},
+    ],
+)
+def test_a_checkpoint_of_another_form_is_refused(trained, tmp_path, change):
+    torch.save(torch.load(trained[1], weights_only=True) | change, tmp_path / "x.ckpt")
+    with pytest.raises(CheckpointError, match=r"x\.ckpt: does not fit this version"):
+        load_module(tmp_path / "x.ckpt")
 
 
 def test_checkpoints_of_before_confidence_was_learnt_still_load(trained, tmp_path):

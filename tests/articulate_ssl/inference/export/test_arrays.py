@@ -72,6 +72,18 @@ def test_half_a_file_is_refused(tmp_path):
     refused(tmp_path, "damaged")
 
 
+def test_a_file_that_is_damaged_within_is_refused(tmp_path):
+    (file,) = write(result_of(synthetic.laptop), tmp_path)
+    content = file.read_bytes()
+    method = content.index(b"PK\x01\x02") + 10  # of compression, in the table of contents
+    for place in (len(content) // 2, method):
+        file.write_bytes(content[:place] + b"\x63" + content[place + 1 :])
+        refused(tmp_path, "damaged")
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    (tmp_path / "array.npy").rename(file)
+    refused(tmp_path, "damaged, or no file of ours")
+
+
 def test_pickled_objects_are_refused(tmp_path):
     write(result_of(synthetic.laptop), tmp_path)
     rewritten(tmp_path, center=np.array([{}], dtype=object))
@@ -85,7 +97,7 @@ def test_a_file_that_lacks_something_is_refused(tmp_path, name):
     refused(tmp_path, f"lacks {name}")
 
 
-@pytest.mark.parametrize("version", [0, 99])
+@pytest.mark.parametrize("version", [0, 99, [1, 2], "one"])
 def test_another_format_is_refused(tmp_path, version):
     write(result_of(synthetic.laptop), tmp_path)
     rewritten(tmp_path, format=np.array(version))

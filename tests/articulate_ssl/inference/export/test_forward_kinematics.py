@@ -153,6 +153,14 @@ def test_any_state_puts_the_meshes_where_the_prediction_articulates(tmp_path, ma
         assert miss(result, states, read(result, tmp_path, states)) < TOLERANCE
 
 
+@pytest.mark.parametrize("reader", ["MJCF by mujoco", "USD by usd-core"])
+def test_an_object_in_metres_of_a_map_is_where_it_was_scanned(tmp_path, reader):
+    (write, read), result = READERS[reader], result_of(ZOO[0], center=np.array([500000.123456, 5400000.654321, 300]))
+    write(result, tmp_path)
+    states = result.prediction.joint_state[0].numpy()
+    assert miss(result, states, read(result, tmp_path, states)) < TOLERANCE
+
+
 @pytest.mark.parametrize("make", ZOO)
 def test_the_parts_of_a_usd_stage_stand_in_the_predicted_state(tmp_path, make):
     result = result_of(make)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import synthetic_predictions as synthetic
 import torch
+import trimesh
 from joint_zoo import ZOO, snake
 from scan_predictions import result_of
 
@@ -119,6 +120,27 @@ def test_the_files_stay_as_they_are(tmp_path):
     before = {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
     check(folder)
     assert {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()} == before
+
+
+def test_meshes_of_an_earlier_and_larger_object_do_not_count(tmp_path):
+    alone = check(exported(tmp_path, synthetic.laptop), metres_per_unit=None)
+    trimesh.creation.box((40, 30, 50)).export(tmp_path / "meshes" / "part_2.stl")
+    assert check(str(tmp_path)) == alone
+
+
+def test_only_the_models_that_are_named_are_tried(tmp_path):
+    folder = exported(tmp_path, synthetic.laptop)
+    assert [file.file for file in check(folder, names=["prediction.json", "object.urdf"]).files] == ["object.urdf"]
+    with pytest.raises(PhysicsCheckError, match="export urdf or mjcf there first"):
+        check(folder, names=["prediction.json"])
+
+
+@pytest.mark.parametrize("content", ["", "<mujoco>", "no XML"])
+def test_a_model_that_is_no_xml_fails_with_its_reason(tmp_path, content):
+    folder = exported(tmp_path, synthetic.laptop)
+    (folder / "object.xml").write_text(content)
+    refused, sound = check(folder).files
+    assert refused.problem and sound.passed
 
 
 def test_without_mujoco_the_error_says_what_to_install(tmp_path, monkeypatch):

@@ -1,3 +1,4 @@
+import socket
 import urllib.request
 
 import numpy as np
@@ -8,6 +9,7 @@ from scan_predictions import OBJECTS, result_of
 from viser.transforms import SO3
 
 from articulate_ssl.inference.articulation import part_motion
+from articulate_ssl.inference.viewer import live
 from articulate_ssl.inference.viewer.live import LiveViewer
 
 
@@ -91,6 +93,16 @@ def test_a_browser_is_answered_until_the_viewer_is_stopped(show):
 
 def test_two_viewers_do_not_share_a_port(show):
     assert show(synthetic.laptop)[0].url != show(synthetic.laptop)[0].url
+
+
+def test_behind_the_last_port_there_is_none(monkeypatch):
+    with socket.socket() as taken:
+        taken.bind((live.HOST, 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        monkeypatch.setattr(live, "LAST_PORT", port)
+        with pytest.raises(OSError, match=f"no port from {port} to {port} is free.*or 0 for any"):
+            LiveViewer(result_of(synthetic.laptop), port)
 
 
 def test_the_camera_looks_at_the_front_from_above(show):
