@@ -226,12 +226,7 @@ def load(
     estimators = [_estimator(weights.file, weights.name, device) for weights in shipped]
     if len(estimators) > 1:
         return EstimatorChoice(estimators, AUTO if str(name_or_path) == AUTO else shipped[0].category)
-    if not estimators and view is not None:
-        raise CheckpointError(
-            f"{name_or_path}: view={view!r} chooses among the weights that come with the package, and this is none of "
-            "them; leave it out"
-        )
-    return estimators[0] if estimators else _estimator(find_weights(name_or_path), str(name_or_path), device)
+    return estimators[0] if estimators else _estimator(find_weights(name_or_path, view), str(name_or_path), device)
 
 
 def as_cloud(

@@ -71,10 +71,16 @@ def find_weights(
     Only a hub id (`owner/name`) that is none of the others touches the network; the options behind `view` are for it.
 
     Raises:
-        CheckpointError: if nothing of this name is here or on the hub, or the hub cannot be reached.
+        CheckpointError: if nothing of this name is here or on the hub, the hub cannot be reached, or a view is chosen
+            of weights that do not come with the package.
     """
     if shipped := shipped_as(str(name_or_path), view):
         return shipped[0].file
+    if view is not None:
+        raise CheckpointError(
+            f"{name_or_path}: view={view!r} chooses among weights of one category that come with the package, which "
+            "this is not; leave it out"
+        )
     path = Path(name_or_path)
     if path.is_dir():
         if not (path / MODEL_FILE).is_file():
