@@ -61,16 +61,15 @@ def tiny_data(root: Path, **options) -> ArticulatedDataModule:
 
 
 def quiet_trainer(folder: Path, **options) -> Trainer:
-    """The real Trainer on the CPU, that prints and keeps nothing."""
+    """The real Trainer on the CPU, that prints nothing, and keeps nothing unless asked to."""
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     return Trainer(
         accelerator="cpu",
         logger=False,
-        enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
         default_root_dir=folder,
-        **options,
+        **{"enable_checkpointing": False} | options,
     )
 
 

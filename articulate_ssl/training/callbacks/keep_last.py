@@ -35,4 +35,4 @@ def write_last(trainer: Trainer) -> None:
         if isinstance(callback, ModelCheckpoint) and callback.save_last:
             last = Path(callback.dirpath, callback.CHECKPOINT_NAME_LAST + callback.FILE_EXTENSION)
             callback.last_model_path = str(last)  # or Lightning takes it for another run's, and numbers its own
-            trainer.save_checkpoint(last, weights_only=False)  # all that goes on needs
+            trainer.save_checkpoint(last, weights_only=False)  # with optimiser and callbacks, or nothing could go on

@@ -4,10 +4,10 @@ import warnings
 
 import pytest
 import torch
-from lightning.pytorch import Callback, Trainer
+from lightning.pytorch import Callback
 from lightning.pytorch.callbacks import ModelCheckpoint
 from synthetic import write_synthetic_set
-from tiny import tiny_data, tiny_module
+from tiny import quiet_trainer, tiny_data, tiny_module
 
 from articulate_ssl.training.callbacks.keep_last import KeepLast
 from articulate_ssl.training.recipes import staged
@@ -28,8 +28,7 @@ def test_discovery_is_kept_where_checkpoints_are(tmp_path, monkeypatch, save_las
     def fit(*more, checkpoint=None):
         module = tiny_module(6, network={"iterations": 1})
         last = ModelCheckpoint(tmp_path, every_n_train_steps=100, save_last=save_last)
-        options = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "accelerator": "cpu"}
-        trainer = Trainer(max_steps=6, callbacks=[last, KeepLast(), *more], default_root_dir=tmp_path, **options)
+        trainer = quiet_trainer(tmp_path, max_steps=6, callbacks=[last, KeepLast(), *more], enable_checkpointing=True)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             trainer.fit(module, tiny_data(tmp_path), ckpt_path=checkpoint)

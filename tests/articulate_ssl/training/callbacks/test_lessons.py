@@ -4,10 +4,9 @@ import warnings
 
 import pytest
 import torch
-from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from synthetic import write_synthetic_set
-from tiny import tiny_data, tiny_module
+from tiny import quiet_trainer, tiny_data, tiny_module
 
 from articulate_ssl.training.callbacks import lessons
 from articulate_ssl.training.lessons import LESSONS, teach
@@ -46,15 +45,7 @@ def fit(root, folder, steps=STEPS, checkpoint=None, **options):
     """Train by the paper's recipe, which learns confidence and nothing else behind its last step."""
     module = tiny_module(steps, recipe="paper", network={"iterations": 1}, **options)
     last = ModelCheckpoint(folder, filename="{step}", every_n_train_steps=2, save_last=True)
-    trainer = Trainer(
-        accelerator="cpu",
-        max_steps=steps,
-        callbacks=[last],
-        logger=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        default_root_dir=folder,
-    )
+    trainer = quiet_trainer(folder, max_steps=steps, callbacks=[last], enable_checkpointing=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         trainer.fit(module, tiny_data(root), ckpt_path=checkpoint)
