@@ -4,11 +4,15 @@ One view hides half of an object, and no single view is a good template. Where s
 in several states each, parts and joints are found there (`grouped`); the views of the category only say how objects are
 turned in front of the camera (`view_orientations`). What teaches the network are views of the scans, simulated
 (`simulated_views`), whose poses and states are known. No label is used; which scans show the same object is.
+
+Canonical space lays hinges over each other, so that an object that is hinged at another side than most lies there.
+Before views of it are simulated it is stood up: what teaches shows it as cameras do, and says that it lies.
 """
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -42,29 +46,40 @@ def discover_from_scans(
     options: DiscoveryOptions,
     orientation: OrientationRange,
     num_points: int,
+    to_stand: Callable[[RegisteredShape, Tensor, Tensor], tuple[Tensor, Tensor]],
 ) -> tuple[Tensor, RegisteredShape]:
     """Simulated views [k, num_points, 3], and parts and joints of the category registered to them.
 
     Args:
         orientation: How far objects are turned in the views.
+        to_stand: Of a shape, the clouds it is registered to, and which of these [m] fit best: by how many quarters [n]
+            objects are to be turned until they stand as most do, and rotations [n, 3, 3] from canonical space as it
+            then stands to canonical space.
 
     Raises:
         DiscoveryError: if parts are not found (`discover_grouped`).
     """
     found = discover_grouped(clouds, scans, instance, num_parts, joint_type, options)
-    kept = _likeliest(found, clouds)[: options.kept(len(clouds))]
-    found, clouds = found.of_clouds(kept), clouds[kept]
+    best = _likeliest(found, clouds)[: options.kept(len(clouds))]
     random, generator = np.random.default_rng(options.seed), torch.Generator().manual_seed(options.seed)
     mean_distance = float((views - views.mean(dim=1, keepdim=True)).norm(dim=-1).mean())
-    turns = OrientationRange().draw(len(clouds) * _VIEWS, generator)
+    quarters = torch.zeros(len(clouds), dtype=torch.long)
+    if orientation.limited:
+        quarters, lying = to_stand(found, clouds, best)
+    best = best[quarters[best] == 0]
+    kept = torch.cat([best, quarters.nonzero()[:, 0]])
+    turns = OrientationRange().draw(len(kept) * _VIEWS, generator)
     if orientation.limited:
         _announce(0, "how objects are turned")
-        sides = turns[: len(clouds) * _SIDES].unflatten(0, (-1, _SIDES))
-        seen, shown = simulate_views(found, clouds, sides, num_points, mean_distance, random)
+        sides = turns[: len(best) * _SIDES].unflatten(0, (-1, _SIDES))
+        seen, shown = simulate_views(found.of_clouds(best), clouds[best], sides, num_points, mean_distance, random)
         stand = find_view_orientations(views, seen, shown.base[:, :3, :3])
-        found, turns = found.turned(stand.mean), stand.draw(len(turns), orientation, generator)
+        found = found.turned(stand.mean)
+        turns = stand.draw(len(turns), orientation, generator).unflatten(0, (-1, _VIEWS))
+        turns = turns @ (stand.mean @ lying[kept].mT @ stand.mean.mT)[:, None]
+    found, clouds = found.of_clouds(kept), clouds[kept]
     _announce(1, "views of the scans")
-    turns = turns.unflatten(0, (-1, _VIEWS))
+    turns = turns.reshape(len(kept), _VIEWS, 3, 3)
     simulated = simulate_views(found, clouds, turns, num_points, mean_distance, random, reshape=True)
     _announce(2, "done")
     return simulated

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -82,6 +82,16 @@ class Bodies(NamedTuple):
     frames: Tensor
     normal: Tensor
     known: Tensor
+
+    def rows(self, rows: Tensor) -> Bodies:
+        """Some of them."""
+        return Bodies(self.points[:, rows], self.surface[:, rows], *(one[rows] for one in self[2:]))
+
+    @staticmethod
+    def cat(several: Iterable[Bodies]) -> Bodies:
+        """All of them."""
+        points, surface, *rest = zip(*several, strict=True)
+        return Bodies(torch.cat(points, dim=1), torch.cat(surface, dim=1), *(torch.cat(one) for one in rest))
 
 
 class HingeSides(WithSurface):
@@ -230,25 +240,44 @@ class HingeSides(WithSurface):
         versions: Sequence[Tensor],  # of [B, P, 3] the same points, as they are or with noise
     ) -> Bodies:
         """What is seen of clouds."""
-        box = self._boxes(prediction, dense)
-        normal = box[:, :, 2]
-        if self.doors:
-            first, own, fewest = *self._doors(prediction, dense, box[:, :, 0]), _FEWEST_POINTS
-        else:
-            first, own, fewest = box, self._behind_the_door(prediction, dense, normal), LOOKS * self.size.read
-        quarter = torch.tensor([0.0, 0.0, math.pi / 2]).to(box) * torch.arange(TURNS).to(box)[:, None]
-        frames = first[:, None] @ roma.rotvec_to_rotmat(quarter)
+        if not self.doors:
+            return self.bodies_at(prediction.base_pose, dense, versions)
+        box = self._boxes(prediction.base_pose, dense)
+        own, points = self._doors(prediction, dense, box[:, :, 0])
+        return self._seen(own, points, _FEWEST_POINTS, box[:, :, 2], versions)
+
+    def bodies_at(
+        self,
+        base: Tensor,  # [B, 4, 4] canonical object space -> camera space
+        dense: Tensor,  # [B, P, 3] farthest-point order
+        versions: Sequence[Tensor],  # of [B, P, 3] the same points, as they are or with noise
+    ) -> Bodies:
+        """What is seen of bodies that stand so, whatever their doors do."""
+        box = self._boxes(base, dense)
+        behind = self._behind_the_door(base, dense, box[:, :, 2])
+        return self._seen(box, behind, LOOKS * self.size.read, box[:, :, 2], versions)
+
+    def _seen(
+        self,
+        frame: Tensor,  # [B, 3, 3] hinge first, door's normal last
+        own: Tensor,  # [B, P] bool, what is shown
+        fewest: int,
+        normal: Tensor,  # [B, 3]
+        versions: Sequence[Tensor],  # of [B, P, 3]
+    ) -> Bodies:
+        quarter = torch.tensor([0.0, 0.0, math.pi / 2]).to(frame) * torch.arange(TURNS).to(frame)[:, None]
+        frames = frame[:, None] @ roma.rotvec_to_rotmat(quarter)
         known = own.sum(dim=1) >= fewest
         own = own | ~known[:, None]  # of these nothing is decided
         described = [surface_alone(version, own, LOOKS * self.size.read) for version in versions]
         points, surface = (torch.stack(some) for some in zip(*described, strict=True))
         return Bodies(points, surface, frames, normal, known)
 
-    def _boxes(self, prediction: Prediction, dense: Tensor) -> Tensor:  # [B, 3, 3]
+    def _boxes(self, base: Tensor, dense: Tensor) -> Tensor:  # [B, 3, 3]
         """Frames of the boxes as they are predicted, each turned to the nearest of the cloud's own axes."""
         axes = manhattan_frames(dense, torch.Generator().manual_seed(0))[0].mT
         every = axes[:, None] @ rotation_group(24).elements.to(axes)  # the same axes in every order
-        said = prediction.base_pose[:, :3, :3] @ self.axes.to(axes)
+        said = base[:, :3, :3] @ self.axes.to(axes)
         nearest = (every * said[:, None]).sum(dim=(-2, -1)).argmax(dim=1)
         return every[torch.arange(len(every), device=every.device), nearest]
 
@@ -283,7 +312,7 @@ class HingeSides(WithSurface):
 
     def _behind_the_door(
         self,
-        prediction: Prediction,
+        base: Tensor,  # [B, 4, 4]
         dense: Tensor,  # [B, P, 3]
         normal: Tensor,  # [B, 3] of the doors, pointing at the bodies
     ) -> Tensor:  # [B, P] bool
@@ -292,7 +321,7 @@ class HingeSides(WithSurface):
         Which part they are said to be of must not matter: about the hinge, pieces of the body are taken for the door,
         and where they are missed says where the hinge is.
         """
-        door = transform_points(prediction.base_pose, self.door.to(dense).expand(len(dense), 1, 3))
+        door = transform_points(base, self.door.to(dense).expand(len(dense), 1, 3))
         return ((dense - door) @ normal[..., None]).squeeze(-1) > _BEHIND
 
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from articulate_ssl.geometry.screw import REVOLUTE
-from articulate_ssl.inference.hinge_sides import DECIDED, Bodies
+from articulate_ssl.inference.hinge_sides import DECIDED, Bodies, HingeSides
 from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.ops.progress import announced, tell
 from articulate_ssl.training.explanations import registered_points, with_noise
@@ -55,12 +55,14 @@ def learn_hinge_sides(
     sides.surface = None
     if network.num_parts != 2 or network.joint_type != REVOLUTE or TAUGHT * len(clouds) < FEWEST:
         return
-    if estimator.view_search.learnt or estimator.handedness.learnt:
-        return  # simulated views, or two hands, say more of which way round views are
+    views = estimator.view_search
+    if estimator.handedness.learnt or (views.learnt and not module.orientation.limited):
+        return  # two hands, or simulated views, say more of which way round views are
     shape = network.category.articulated_shape(network.joint_type)
     sides.measure(shape, module.states.known, estimator.part_frames)
     if module.orientation.limited:
-        _learn_upright(module, clouds[:_VIEWS])
+        base = views.base if views.learnt else _base_poses(module, clouds[:_VIEWS])
+        _learn_upright(sides, base[:, :3, :3])
         return
     predictions = _predictions(module, clouds[:_FIRST])
     if not _seen_enough(_bodies(module, clouds[:_FIRST], predictions)):
@@ -85,10 +87,16 @@ def _seen_enough(bodies: Bodies) -> bool:
     return float(bodies.known.double().mean()) >= _KNOWN
 
 
-def _learn_upright(module: ArticulatedPoseModule, views: Tensor) -> None:
+def _base_poses(module: ArticulatedPoseModule, views: Tensor) -> Tensor:
+    """[n, 4, 4] canonical object space -> camera, as views are predicted."""
+    return torch.cat([one.base_pose for one in _predictions(module, views)])
+
+
+def _learn_upright(
+    sides: HingeSides,
+    rotation: Tensor,  # [n, 3, 3] canonical object space -> camera, as views are predicted, or were simulated
+) -> None:
     """Find out which way is up for an upright camera, and whether some objects do not stand as they are predicted."""
-    sides = module.estimator.hinge_sides
-    rotation = torch.cat([one.base_pose[:, :3, :3] for one in _predictions(module, views)])
     sides.camera.learn(rotation, sides.axes)
     if sides.camera.learnt:
         _, quarters, stand = sides.camera.stood(rotation)
@@ -105,7 +113,7 @@ def _learnt(module: ArticulatedPoseModule, bodies: Bodies) -> bool:
     known = bodies.known.nonzero()[:, 0]
     order = known[torch.randperm(len(known), generator=torch.Generator().manual_seed(0)).to(known.device)]
     count = int(TAUGHT * len(order))
-    taught, rest = _rows(bodies, order[:count]), _rows(bodies, order[count:])
+    taught, rest = bodies.rows(order[:count]), bodies.rows(order[count:])
     every, ways = torch.arange(count, device=order.device)[:, None], torch.arange(len(sides.quarters)).to(order)
     turned = torch.zeros_like(every)
     seen, rounds, doubt = ("doors", 1, _DOUBT) if sides.doors else ("bodies", _ROUNDS, 0.0)
@@ -140,24 +148,18 @@ def _predictions(module: ArticulatedPoseModule, clouds: Tensor) -> list[Predicti
 
 def _bodies(module: ArticulatedPoseModule, clouds: Tensor, predictions: Sequence[Prediction]) -> Bodies:
     """What is seen of training clouds, as they are and with noise."""
-    sides, generator, found = module.estimator.hinge_sides, torch.Generator().manual_seed(0), []
-    for some, prediction in zip(
-        announced(log, "hinge sides, surfaces", clouds.split(_BATCH)), predictions, strict=True
-    ):
-        found.append(sides.bodies(prediction, some, (some, with_noise(some, generator))))
-    points, surface, *rest = zip(*found, strict=True)
-    return Bodies(torch.cat(points, dim=1), torch.cat(surface, dim=1), *(torch.cat(one) for one in rest))
-
-
-def _rows(bodies: Bodies, rows: Tensor) -> Bodies:
-    """Some of them."""
-    return Bodies(bodies.points[:, rows], bodies.surface[:, rows], *(one[rows] for one in bodies[2:]))
+    sides, generator = module.estimator.hinge_sides, torch.Generator().manual_seed(0)
+    shown = announced(log, "hinge sides, surfaces", clouds.split(_BATCH))
+    return Bodies.cat(
+        sides.bodies(prediction, some, (some, with_noise(some, generator)))
+        for some, prediction in zip(shown, predictions, strict=True)
+    )
 
 
 def _odds(module: ArticulatedPoseModule, bodies: Bodies) -> Tensor:
     """How right they look in each of their ways [n, W]."""
     chunks = torch.arange(len(bodies.known), device=bodies.known.device).split(_CHUNK)
-    return torch.cat([module.estimator.hinge_sides.looks_right(_rows(bodies, rows)) for rows in chunks])
+    return torch.cat([module.estimator.hinge_sides.looks_right(bodies.rows(rows)) for rows in chunks])
 
 
 def _shares(odds: Tensor) -> Tensor:

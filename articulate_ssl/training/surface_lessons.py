@@ -132,18 +132,22 @@ def believable(odds: Tensor) -> Tensor:
 
 
 def teach(
-    lessons: Lessons, work: str = "a network learns to decide", size: SurfaceSize | None = None
+    lessons: Lessons,
+    work: str = "a network learns to decide",
+    size: SurfaceSize | None = None,
+    times: int | None = None,
 ) -> SurfaceDecision:
     """A new network that has learnt them.
 
     Args:
         work: What progress is called.
         size: Of the network; None is that of a decision between two explanations.
+        times: How often each cloud is shown; None is `TIMES`.
     """
     size = size or SIZE
     device = lessons.points.device
     generator = torch.Generator().manual_seed(0)
-    steps = math.ceil(TIMES * lessons.points.shape[1] / BATCH)
+    steps = math.ceil((times or TIMES) * lessons.points.shape[1] / BATCH)
     with torch.random.fork_rng(devices=[]), torch.enable_grad():
         torch.manual_seed(0)
         decision = SurfaceDecision(size).to(device)

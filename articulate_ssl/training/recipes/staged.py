@@ -32,6 +32,7 @@ from articulate_ssl.losses.objective import PoseTarget, staged_terms
 from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.ops.ranks import own_rows, world
 from articulate_ssl.shape.observation import Observation
+from articulate_ssl.training.lying_scans import quarters_to_stand
 from articulate_ssl.training.recipes.recipe import Outcome, Recipe, TrainingClouds
 
 # Registration that teaches, in every step: shorter than at test time. Chosen, not measured.
@@ -125,7 +126,8 @@ class TrainingRecipe(Recipe):
             objects = data.objects(max(options.clouds, whole))
         if self._simulated:
             scans = data.scans(options.clouds), *objects
-            return discover_from_scans(clouds, *scans, *category, observation.orientation, num_points)
+            found_in = (*scans, *category, observation.orientation, num_points)
+            return discover_from_scans(clouds, *found_in, to_stand=quarters_to_stand)
         if options.grouped:
             return clouds, discover_grouped(clouds, *objects, *category)
         return clouds, discover(clouds, *category, observation)
