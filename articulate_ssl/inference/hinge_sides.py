@@ -32,7 +32,9 @@ import torch
 from scipy.spatial import ConvexHull
 from torch import Tensor
 from torch.nn import functional
+from torch.nn.functional import one_hot
 
+from articulate_ssl.discovery.instance_fit import smooth_labels
 from articulate_ssl.discovery.manhattan_frame import manhattan_frames
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.screw import REVOLUTE, screw_motion
@@ -154,6 +156,8 @@ class HingeSides(WithSurface):
             shape = replace(shape, joints=replace(shape.joints, axis=frames.direction))
             axes, own = frames.about_joint(root), frames.about_joint(child)
         else:
+            # Points of the body that are said to be of the door make its box another.
+            shape = replace(shape, label=smooth_labels(shape.points, 1 - one_hot(shape.label).to(shape.points)))
             axes, own = object_axes(shape), _box_axes(shape, child)
         hinge, one, other = axes[:, 0], own[:, 1], axes[:, 1]
         # A closed door is square to its body, and the whole is small.
