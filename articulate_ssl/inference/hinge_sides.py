@@ -32,9 +32,7 @@ import torch
 from scipy.spatial import ConvexHull
 from torch import Tensor
 from torch.nn import functional
-from torch.nn.functional import one_hot
 
-from articulate_ssl.discovery.instance_fit import smooth_labels
 from articulate_ssl.discovery.manhattan_frame import manhattan_frames
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.screw import REVOLUTE, screw_motion
@@ -62,6 +60,8 @@ _BEHIND = 0.12
 # turned upside down in half of its clouds, by .6 to 1.5; most ovens are told by 10 and more (step 227). Chosen earlier,
 # for lessons, of which it says what they leave undecided.
 DECIDED = 2.0
+# Of so many points about one of a door, the share of the door's below which it is taken for a stray one. Chosen.
+_NEIGHBOURS, _STRAY = 16, 0.3
 _CLOSED_REACH = math.radians(120)  # from the middle of the joint's range: the closed door is not farther. Chosen.
 
 log = logging.getLogger(__name__)
@@ -156,8 +156,7 @@ class HingeSides(WithSurface):
             shape = replace(shape, joints=replace(shape.joints, axis=frames.direction))
             axes, own = frames.about_joint(root), frames.about_joint(child)
         else:
-            # Points of the body that are said to be of the door make its box another.
-            shape = replace(shape, label=smooth_labels(shape.points, 1 - one_hot(shape.label).to(shape.points)))
+            shape = _without_strays(shape, child)
             axes, own = object_axes(shape), _box_axes(shape, child)
         hinge, one, other = axes[:, 0], own[:, 1], axes[:, 1]
         # A closed door is square to its body, and the whole is small.
@@ -363,6 +362,13 @@ def _plane(
     middle = (dense * weight).sum(dim=1, keepdim=True)
     away = dense - middle
     return middle, torch.linalg.eigh((away * weight).mT @ away)[1][..., 0]
+
+
+def _without_strays(shape: ArticulatedShape, part: int) -> ArticulatedShape:
+    """The same but for points of a part that lie among those of another: they would make its box another."""
+    near = shape.label[torch.cdist(shape.points, shape.points).topk(_NEIGHBOURS, largest=False).indices]
+    stray = (shape.label == part) & ((near == part).to(shape.points).mean(dim=1) < _STRAY)
+    return replace(shape, label=torch.where(stray, near.mode(dim=1).values, shape.label))
 
 
 def _box_axes(shape: ArticulatedShape, part: int) -> Tensor:

@@ -1,6 +1,7 @@
 """A box that lies on its side stands up: its parts and joint stay where they are, its frame turns."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -9,8 +10,9 @@ import roma
 import torch
 from tiny import POINTS, tiny_module
 
+from articulate_ssl.discovery.registered_shape import RegisteredShape
 from articulate_ssl.geometry.kinematic_chain import KinematicChain
-from articulate_ssl.geometry.screw import REVOLUTE, screw_motion
+from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE, screw_motion
 from articulate_ssl.geometry.se3 import se3, transform_points
 from articulate_ssl.inference.hinge_sides import BODY_SIZE, DOOR_SIZE, TURNS, Bodies, HingeSides, turned_about
 from articulate_ssl.inference.part_frames import PartFrames
@@ -19,8 +21,9 @@ from articulate_ssl.inference.surface_decision import LOOKS, SIZE, SurfaceDecisi
 from articulate_ssl.network.surface_network import SurfaceSize
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.joints import Joints
-from articulate_ssl.training import hinge_lessons
+from articulate_ssl.training import hinge_lessons, lying_scans
 from articulate_ssl.training.hinge_lessons import learn_hinge_sides
+from articulate_ssl.training.lying_scans import quarters_to_stand
 
 TINY = SurfaceSize(read=48, centers=32, dims=(8, 8), radii=(0.3, 0.5), num_neighbors=8, global_dim=16, head_dim=16)
 QUARTER = math.pi / 2
@@ -275,7 +278,7 @@ def test_a_door_of_few_points_is_looked_at_again_and_of_fewer_not_at_all(count, 
     sides = _sides()
     sides.doors.fill_(True)
     prediction, dense, _ = _lying([0], 2.2)
-    own = sides._doors(prediction, dense, sides._boxes(prediction, dense)[:, :, 0])[1]
+    own = sides._doors(prediction, dense, sides._boxes(prediction.base_pose, dense)[:, :, 0])[1]
     behind = ((dense - prediction.base_pose[:, None, :3, 3]) @ prediction.base_pose[:, :3, 2:3]).squeeze(-1) > 0
     some = torch.cat([dense[own][:count], dense[~own & behind]])[None]
     bodies = sides.bodies(prediction, some, (some,))
@@ -411,6 +414,69 @@ def test_an_upright_camera_needs_no_network(monkeypatch, share, learnt):
         stood, quarters = sides.decided(replace(prediction, base_pose=poses[rows]), None)
         assert quarters.tolist() == [0, 3]
         torch.testing.assert_close(stood.base_pose[:, :3, 1], torch.tensor([[0.0, 1.0, 0.0]] * 2), atol=1e-5, rtol=0)
+
+
+def test_of_simulated_views_it_is_known_which_lie(monkeypatch):
+    lying = (torch.rand(200, generator=torch.Generator().manual_seed(2)) < 0.12).float()
+    poses, known = _seen_by_an_upright_camera(lying), _sides()
+    monkeypatch.setattr(hinge_lessons, "FEWEST", 20)
+    monkeypatch.setattr(hinge_lessons, "_predictions", None)  # nothing is asked
+    monkeypatch.setattr(HingeSides, "measure", lambda self, *_: self.axes.copy_(known.axes))
+    for orientation, learnt in ((100.0, True), (180.0, False)):
+        module = tiny_module(num_parts=2, orientation_range=orientation).eval()
+        points, part = torch.rand(200, POINTS, 3), torch.zeros(200, POINTS)
+        module.view_search.learn(points, poses, torch.zeros(200, 1), part)
+        learn_hinge_sides(module, torch.zeros(200, POINTS, 3))
+        assert bool(module.hinge_sides.learnt) == bool(module.hinge_sides.camera.learnt) == learnt
+
+
+def _scans(quarters: list[int], opened: Sequence[float]) -> tuple[RegisteredShape, torch.Tensor, torch.Tensor]:
+    """Scans of objects that lie by so many quarters, registered; their clouds, and how canonical space truly stands."""
+    prediction, dense, stands = _lying(quarters)
+    state = ZERO + torch.tensor(opened)[:, None]
+    error = torch.arange(len(quarters)).float()
+    found = RegisteredShape(_shape(), prediction.base_pose, state, torch.zeros(len(quarters), 2, 3), error)
+    return found, dense, stands
+
+
+@pytest.fixture
+def few_scans(monkeypatch):
+    monkeypatch.setattr(lying_scans, "_FEWEST", 10)
+    monkeypatch.setattr(lying_scans, "teach", lambda *_: _TopIsUp())
+
+
+def test_scans_that_lie_are_found_and_stood_up(few_scans):
+    """Whether they fit well or not; but where the joint is beyond where others are, nothing is believed."""
+    quarters = [0] * 14 + [3] + [0, 3, 1, 2, 3]
+    opened = [0.8, 1.0, 1.2, 1.4, 1.6] * 3 + [1.2] * 4 + [3.0]
+    found, dense, stands = _scans(quarters, opened)
+    told, turn = quarters_to_stand(found, dense, torch.arange(15))
+    assert told.tolist() == [*quarters[:-1], 0]
+    torch.testing.assert_close((found.base[:, :3, :3] @ turn)[:-1], stands[:-1], atol=1e-4, rtol=0)
+    torch.testing.assert_close(turn[-1], torch.eye(3))
+
+
+def test_scans_stay_where_bodies_do_not_tell(few_scans, monkeypatch):
+    found, dense, _ = _scans([0, 2, 1, 3] * 4, [1.2] * 16)  # half of those that are left out seem to lie
+    assert quarters_to_stand(found, dense, torch.arange(16))[0].tolist() == [0] * 16
+    found, dense, _ = _scans([3] * 2 + [0] * 14, [1.2] * 16)
+    assert quarters_to_stand(found, dense, torch.arange(2, 16))[0].tolist() == [3] * 2 + [0] * 14
+    monkeypatch.setattr(lying_scans, "teach", None)  # nothing is taught
+    for best, cloud in ((torch.arange(9), dense), (torch.arange(16), dense[:, :600])):
+        told, turn = quarters_to_stand(found, cloud, best)
+        assert told.tolist() == [0] * 16
+        torch.testing.assert_close(turn, torch.eye(3).expand(16, 3, 3))
+    slides = replace(found, shape=replace(found.shape, joints=replace(found.shape.joints, joint_type=PRISMATIC)))
+    assert quarters_to_stand(slides, dense, torch.arange(16))[0].tolist() == [0] * 16
+
+
+def test_a_few_points_of_the_body_do_not_make_the_door_another():
+    shape = _shape()
+    label = shape.label.clone()
+    label[:480:60] = 1
+    sides = HingeSides()
+    sides.measure(replace(shape, label=label), torch.tensor([[ZERO + 0.9, ZERO + 1.8]]))
+    assert float(sides.closed) == pytest.approx(ZERO, abs=0.02)
 
 
 def test_nothing_is_learnt_where_too_little_is_seen(box_module, monkeypatch):
