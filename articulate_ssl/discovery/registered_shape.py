@@ -10,9 +10,11 @@ from torch import Tensor
 from articulate_ssl.discovery.instance_fit import InstanceFit
 from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.discovery.similar_clouds import LabelledClouds
+from articulate_ssl.geometry.kinematic_chain import KinematicChain, extract_chain, pair_index
 from articulate_ssl.geometry.orientation_range import mean_rotation
 from articulate_ssl.geometry.se3 import invert_se3, se3
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
+from articulate_ssl.shape.joints import pair_of_joints
 
 # Joint limits: where nine tenths of the clouds' states lie, and a margin for what few clouds show.
 _LIMIT_QUANTILES = (0.05, 0.95)
@@ -74,6 +76,35 @@ class RegisteredShape:
     def limited(self) -> ArticulatedShape:
         """The shape with these limits."""
         return replace(self.shape, joints=replace(self.shape.joints, limits=self.limits()))
+
+    def in_the_trees_order(self) -> RegisteredShape:
+        """The same, named as the tree of a category with these joints is (`extract_chain`), which poses are told by.
+
+        Of two parts the first is the base: if the second is, they exchange names. Joints come in the tree's order.
+        """
+        found, chain = self, self.shape.joints.chain
+        if chain.num_parts == 2 and chain.root == 1:
+            found, chain = self._with_names_exchanged(), KinematicChain(2, 0, (0,), (1,))
+        joined = torch.zeros(len(pair_index(chain.num_parts)))
+        joined[pair_of_joints(chain)] = 1
+        tree = extract_chain(joined, chain.num_parts)
+        order, joints = [chain.child.index(child) for child in tree.child], found.shape.joints
+        limits = None if joints.limits is None else joints.limits[order]
+        joints = replace(joints, chain=tree, axis=joints.axis[order], pivot=joints.pivot[order], limits=limits)
+        return replace(found, shape=replace(found.shape, joints=joints), state=found.state[:, order])
+
+    def _with_names_exchanged(self) -> RegisteredShape:
+        """Of two parts each has the other's name; the tree is as it was."""
+        axes, beside, part, labelled = self.axes, self.beside, self.point_part, self.labelled
+        return replace(
+            self,
+            shape=replace(self.shape, label=1 - self.shape.label),
+            log_stretch=self.log_stretch.flip(1),
+            axes=None if axes is None else axes.flip(0),
+            beside=None if beside is None else beside.flip(1),
+            point_part=None if part is None else 1 - part,
+            labelled=None if labelled is None else labelled._replace(part=1 - labelled.part),
+        )
 
     def turned_to_mean(self) -> RegisteredShape:
         """The same with the canonical space turned as the clouds are in the mean."""

@@ -135,7 +135,15 @@ class CategoryObject(nn.Module):
 
     @torch.no_grad()
     def adopt(self, shape: ArticulatedShape) -> None:
-        """Take over a discovered shape and its joints."""
+        """Take over a discovered shape and its joints.
+
+        Raises:
+            ValueError: if its tree hangs otherwise than this category's would, by which poses and states are told.
+        """
+        joined = torch.zeros_like(self.confidence)
+        joined[pair_of_joints(shape.joints.chain)] = _FOUND
+        if (tree := extract_chain(joined, self.num_parts)) != shape.joints.chain:
+            raise ValueError(f"the tree is {shape.joints.chain}, the category's would be {tree}: rename its parts")
         shape_points = self.template.shape[1]
         for part in range(self.num_parts):
             points = shape.part(part).cpu().numpy()
@@ -145,9 +153,8 @@ class CategoryObject(nn.Module):
             self.assembly[part] = center
             self.template[part] = thinned - center
             self.principal_axes[part] = principal_directions(thinned)
-        self.confidence.zero_()
         for j, pair in enumerate(pair_of_joints(shape.joints.chain)):
             self.axis[pair] = shape.joints.axis[j]
             self.pivot[pair] = shape.joints.pivot[j]
-            self.confidence[pair] = _FOUND
+        self.confidence.copy_(joined)
         self.mean_confidence.copy_(self.confidence)

@@ -96,6 +96,7 @@ class TrainingRecipe(Recipe):
         network = self.estimator.articulated
         with torch.random.fork_rng(devices=[]), torch.no_grad():
             clouds, found = self._discovered(data, num_points)
+            found = found.in_the_trees_order()
             if network.shared_axis and network.num_parts > 2:
                 found = with_parallel_axes(found, clouds, self.discovery)
         # All simulated views are of clouds that fit well.

@@ -2,12 +2,17 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 from articulated_objects import DRAWER, GLASSES, LAPTOP, clouds, true_shape
+from tiny import tiny_module
 
 from articulate_ssl.discovery.instance_fit import InstanceFit
 from articulate_ssl.discovery.registered_shape import RegisteredShape
+from articulate_ssl.geometry.kinematic_chain import KinematicChain
+from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import se3
+from articulate_ssl.ops.chamfer import nearest_distance
 
 
 def _registered(design) -> RegisteredShape:
@@ -25,6 +30,56 @@ def test_turning_the_canonical_space_moves_nothing():
     turned = found.turned(torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
     torch.testing.assert_close(_posed(turned), _posed(found))
     assert not torch.allclose(turned.base, found.base)
+
+
+def _hung_from_the_second(found: RegisteredShape) -> RegisteredShape:
+    """The same two parts as a tree that hangs from the second."""
+    joints = replace(found.shape.joints, chain=KinematicChain(2, 1, (1,), (0,)))
+    base = found.shape.joints.part_pose(found.base, found.state)[:, 1]
+    return replace(found, shape=replace(found.shape, joints=joints), base=base, state=-found.state)
+
+
+def test_a_category_poses_what_was_found_whichever_part_the_tree_hung_from():
+    """A base that is the second part of two was taken for the first: what taught was turned the wrong way."""
+    found = _registered(LAPTOP)
+    stretch = torch.arange(float(found.log_stretch.numel())).view_as(found.log_stretch)
+    part = found.shape.label.expand(len(found.base), -1)
+    found = replace(found, log_stretch=stretch, point_part=part)
+    hung = _hung_from_the_second(found)
+    torch.testing.assert_close(_posed(hung), _posed(found), atol=1e-5, rtol=0)
+    named = hung.in_the_trees_order()
+    torch.testing.assert_close(_posed(named), _posed(found), atol=1e-5, rtol=0)
+    assert torch.equal(named.shape.label, 1 - found.shape.label)
+    assert torch.equal(named.log_stretch, stretch[:, [1, 0]]) and torch.equal(named.point_part, 1 - part)
+
+    network = tiny_module(num_parts=2).articulated
+    network.category.adopt(named.shape)
+    adopted = network.category.articulated_shape(REVOLUTE)
+    assert nearest_distance(adopted.posed(named.base, named.state), _posed(found)).max() < 1e-3
+    with pytest.raises(ValueError, match="rename its parts"):
+        network.category.adopt(hung.shape)
+
+
+def test_what_is_named_as_trees_are_stays():
+    for design in (LAPTOP, GLASSES, DRAWER):
+        found = _registered(design)
+        named = found.in_the_trees_order()
+        assert named.shape.joints.chain == found.shape.joints.chain
+        assert torch.equal(named.state, found.state) and torch.equal(named.shape.label, found.shape.label)
+
+
+def test_joints_come_in_the_trees_order():
+    found = _registered(GLASSES)
+    joints = found.shape.joints
+    assert joints.chain.child == (1, 2)
+    chain = KinematicChain(3, 0, (0, 0), (2, 1))
+    turned = replace(joints, chain=chain, axis=joints.axis.flip(0), pivot=joints.pivot.flip(0))
+    other = replace(found, shape=replace(found.shape, joints=turned), state=found.state.flip(1))
+    torch.testing.assert_close(_posed(other), _posed(found))
+    named = other.in_the_trees_order()
+    assert named.shape.joints.chain == joints.chain
+    torch.testing.assert_close(named.state, found.state)
+    torch.testing.assert_close(named.shape.joints.pivot, joints.pivot)
 
 
 def test_where_parts_lie_beside_their_slide_is_kept():

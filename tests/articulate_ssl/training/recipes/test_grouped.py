@@ -16,6 +16,7 @@ from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.losses.objective import ObjectiveOptions
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.joints import Joints
+from articulate_ssl.training.lying_scans import quarters_to_stand
 from articulate_ssl.training.recipes import staged
 from datamodules.manifest import ManifestError
 
@@ -116,7 +117,8 @@ def test_views_are_taught_by_scans_of_the_category(tmp_path, monkeypatch):
     scans = write_synthetic_set(tmp_path / "scans", states=9)
     given = {}
 
-    def from_scans(views, clouds, objects, instance, *rest):
+    def from_scans(views, clouds, objects, instance, *rest, to_stand):
+        assert to_stand is quarters_to_stand
         given["all"] = views, clouds, objects, instance
         given["rest"] = rest
         return clouds[:4, :POINTS], replace(_some_shape(clouds[:4]), point_part=parts)
