@@ -234,6 +234,7 @@ class PoseEstimator(Proposals):
             if registers and fits:
                 before = self.final.distance(chosen, points)
                 chosen, other, margin = self.final.within_limits(chosen, other, margin, points, dense)
+                chosen, other, margin, votes = self._hinged_as_fits(chosen, other, margin, votes, points, dense)
                 if self.view_search.parts is not None and self.object_frame.learnt and dense is not None:
                     turn = (chosen.base[:, 0, :3, :3] @ self.object_frame.axes).mT
                     votes = self.view_search.parts.beside(votes, dense, turn)
@@ -245,6 +246,45 @@ class PoseEstimator(Proposals):
                 chosen = self.front_ends.placed(chosen, self.object_frame, category, dense, found.dense_part_id)
                 found = self._packaged(chosen, points, margin, votes, dense)
             return found, rival, found.reconstruction_error if before is None else before
+
+    def _hinged_as_fits(
+        self,
+        one: Hypotheses,  # H = 1, in the clouds' proportions
+        rival: Hypotheses,  # H = 1
+        margin: Tensor,  # [B]
+        votes: Votes | None,
+        points: Tensor,  # [B, N, 3]
+        dense: Tensor | None,  # [B, P, 3]
+    ) -> tuple[Hypotheses, Hypotheses, Tensor, Votes | None]:  # H = 1, H = 1, [B]
+        """Explanations, or what views say of objects that are hinged otherwise, where that fits better.
+
+        Few of the simulated views lie, as few objects are hinged elsewhere than most, and a view of such an object is
+        often more like one of the many others. Once either has the cloud's proportions, errors tell
+        (docs/experiments.md, step 242).
+        """
+        views, camera = self.view_search, self.hinge_sides.camera
+        if not (views.learnt and camera.learnt):
+            return one, rival, margin, votes
+        first, lies = one, camera.stood(one.base[:, 0, :3, :3])[1] > 0
+        shown = camera.stood(views.base[:, :3, :3].to(points))[1] > 0
+        for lying in (False, True):
+            rows, among = (lies != lying).nonzero()[:, 0], (shown == lying).nonzero()[:, 0]
+            if not len(rows) or not len(among):
+                continue
+            own = points[rows]
+            seen = views.search(own, shown=among)
+            start = self.articulated.category_at(seen.base[:, :1], seen.state[:, :1])
+            tried, _ = self.registration.registered(start, own)
+            tried = self.final.in_proportion(tried, own, None if dense is None else dense[rows])
+            error, before = self.final.distance(tried, own), self.final.distance(first.rows(rows), own)
+            sought = (camera.stood(tried.base[:, 0, :3, :3])[1] > 0) == lying
+            fits = (sought & self.states.contains(tried.state[:, 0]) & (error < before)).nonzero()[:, 0]
+            better = rows[fits]
+            one, rival = one.with_rows(better, tried.rows(fits)), rival.with_rows(better, first.rows(better))
+            margin = margin.index_copy(0, better, 1 - error[fits] / before[fits])
+            share = votes.share.index_copy(0, better, seen.votes.share[fits])
+            votes = Votes(votes.points, share)
+        return one, rival, margin, votes
 
     def _as_most_are(
         self,
@@ -455,7 +495,8 @@ class PoseEstimator(Proposals):
         votes: Votes | None = None,
     ) -> tuple[Prediction, Tensor]:
         """Explanations in the clouds' proportions, packaged; and their errors [B] before that."""
-        shown, _, margin = self.final.within_limits(one, rival, margin, points, dense)
+        shown, rival, margin = self.final.within_limits(one, rival, margin, points, dense)
+        shown, _, margin, votes = self._hinged_as_fits(shown, rival, margin, votes, points, dense)
         return self._packaged(shown, points, margin, votes, dense), self.final.distance(one, points)
 
     def _packaged(

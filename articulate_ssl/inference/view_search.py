@@ -115,15 +115,17 @@ class ViewSearch(nn.Module):
         self,
         points: Tensor,  # [B, N, 3] depth views, farthest-point order
         turn: Tensor | None = None,  # [B, 3, 3] canonical object space -> view
+        shown: Tensor | None = None,  # [S]
     ) -> Seen:
         """Compare with all views, register those that are most alike, and ask the best of these.
 
         Args:
             turn: Only views whose objects are turned about so are compared.
+            shown: Without that, which views are; None are all.
         """
         views, step, base, state = (value.to(points) for value in (self.views, self.step, self.base, self.state))
         views = from_few_bytes(views, step)
-        every = torch.arange(len(views), device=points.device)
+        every = torch.arange(len(views), device=points.device) if shown is None else shown
         thin, still = views[:, :_COMPARED].contiguous(), torch.eye(3).to(points)[None]
         found, states, errors, votes = [], [], [], []
         for i, cloud in enumerate(points):

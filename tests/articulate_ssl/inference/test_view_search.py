@@ -11,6 +11,7 @@ from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import se3, transform_points
 from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.inference.pose_estimation import PoseEstimator
+from articulate_ssl.inference.upright_camera import UprightCamera
 from articulate_ssl.inference.view_search import ViewSearch
 from articulate_ssl.network.articulated_network import ArticulatedNetwork
 from articulate_ssl.network.options import NetworkOptions
@@ -159,3 +160,45 @@ def test_the_search_decides_and_hypotheses_turned_alike_compete(learnt, estimato
     near = _degrees(others.base[..., :3, :3], turn[:, None].expand(-1, others.base.shape[1], -1, -1)) < 30
     least = others.error.masked_fill(~near, torch.inf).amin(dim=1)
     assert (found.reconstruction_error <= least + 1e-3).all()
+
+
+class _Camera:
+    """Every second view lies; explanations stand, and what is sought instead lies."""
+
+    def __init__(self) -> None:
+        self.asked = []
+
+    def stood(self, rotation):
+        if len(rotation) == 300:
+            return rotation, torch.arange(300) % 2, None
+        self.asked.append(len(rotation))
+        return rotation, torch.full((len(rotation),), int(len(self.asked) > 1)), None
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("known", [True, False])  # which leaves the estimator as it was
+def test_what_is_hinged_otherwise_is_sought_among_its_own_views_and_believed_where_it_fits_better(
+    learnt, estimator, monkeypatch, known
+):
+    data = _views(3, seed=6)
+    points = data.points[:, :256]
+    estimator.view_search.load_state_dict(learnt.state_dict())
+    camera = _Camera()
+    monkeypatch.setattr(UprightCamera, "stood", camera.stood)
+    estimator.hinge_sides.camera.learnt.fill_(known)
+    base = data.base.clone()
+    base[:2, :3, :3] = base[:2, :3, :3] @ OVER
+    one = estimator.articulated.category_at(base[:, None], data.state[:, None])
+    one = estimator.final.in_proportion(one, points, data.points)
+    votes = estimator.view_search.search(points).votes
+    votes = votes._replace(share=torch.full_like(votes.share, 0.5))
+    found, rival, margin, said = estimator._hinged_as_fits(one, one, torch.full((3,), 2.0), votes, points, data.points)
+    if not known:
+        assert found is one and said is votes and not camera.asked
+        return
+    assert camera.asked == [3, 3]  # what stands is not sought again
+    assert _degrees(found.base[:2, 0, :3, :3], data.base[:2, :3, :3]).max() < 20
+    torch.testing.assert_close(found.base[2], one.base[2])
+    torch.testing.assert_close(rival.base, one.base)
+    assert (margin[:2] > 0).all() and (margin[:2] < 1).all() and margin[2] == 2
+    assert (said.share[:2] != 0.5).any() and (said.share[2] == 0.5).all()
