@@ -10,11 +10,10 @@ from torch import Tensor
 from articulate_ssl.discovery.instance_fit import InstanceFit
 from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.discovery.similar_clouds import LabelledClouds
-from articulate_ssl.geometry.kinematic_chain import KinematicChain, extract_chain, pair_index
 from articulate_ssl.geometry.orientation_range import mean_rotation
 from articulate_ssl.geometry.se3 import invert_se3, se3
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
-from articulate_ssl.shape.joints import pair_of_joints
+from articulate_ssl.shape.joints import category_chain
 
 # Joint limits: where nine tenths of the clouds' states lie, and a margin for what few clouds show.
 _LIMIT_QUANTILES = (0.05, 0.95)
@@ -78,16 +77,14 @@ class RegisteredShape:
         return replace(self.shape, joints=replace(self.shape.joints, limits=self.limits()))
 
     def in_the_trees_order(self) -> RegisteredShape:
-        """The same, named as the tree of a category with these joints is (`extract_chain`), which poses are told by.
+        """The same, named as the tree of a category with these joints is (`category_chain`), which poses are told by.
 
         Of two parts the first is the base: if the second is, they exchange names. Joints come in the tree's order.
         """
         found, chain = self, self.shape.joints.chain
-        if chain.num_parts == 2 and chain.root == 1:
-            found, chain = self._with_names_exchanged(), KinematicChain(2, 0, (0,), (1,))
-        joined = torch.zeros(len(pair_index(chain.num_parts)))
-        joined[pair_of_joints(chain)] = 1
-        tree = extract_chain(joined, chain.num_parts)
+        tree = category_chain(chain)
+        if chain.num_parts == 2 and chain.root != tree.root:
+            found, chain = self._with_names_exchanged(), tree
         order, joints = [chain.child.index(child) for child in tree.child], found.shape.joints
         limits = None if joints.limits is None else joints.limits[order]
         joints = replace(joints, chain=tree, axis=joints.axis[order], pivot=joints.pivot[order], limits=limits)

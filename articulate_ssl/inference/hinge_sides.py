@@ -246,8 +246,8 @@ class HingeSides(WithSurface):
         if not self.doors:
             return self.bodies_at(prediction.base_pose, dense, versions)
         box = self._boxes(prediction.base_pose, dense)
-        own, points = self._doors(prediction, dense, box[:, :, 0])
-        return self._seen(own, points, _FEWEST_POINTS, box[:, :, 2], versions)
+        frame, inside = self._doors(prediction, dense, box[:, :, 0])
+        return self._seen(frame, inside, _FEWEST_POINTS, box[:, :, 2], versions)
 
     def bodies_at(
         self,

@@ -11,7 +11,7 @@
    labelled, they say which parts points are of, and where the category's shape is (`sliding_search`).
    Where simulated views taught, those that a view is most like decide which way round it is, and say with the
    posed shape which parts points are of (`view_search`); what slides is in the end where these points are
-   (`front_ends`).
+   (`front_ends`), and where some objects are hinged elsewhere, either kind is tried (`other_hinges`).
 4. *Decision* between two explanations of a cloud, where that was learnt (`decision`): the winner and its twin, which is
    registered, too, if the winner was, or the winner and its rival.
 5. *Side*, where some doors are hinged at another side than most: frames are turned so that what is seen looks right
@@ -50,6 +50,7 @@ from articulate_ssl.inference.hinge_sides import HingeSides
 from articulate_ssl.inference.hypothesis_registration import HypothesisRegistration
 from articulate_ssl.inference.object_frame import ObjectFrame
 from articulate_ssl.inference.options import InferenceOptions
+from articulate_ssl.inference.other_hinges import OtherHinges
 from articulate_ssl.inference.packaging import as_prediction
 from articulate_ssl.inference.part_frames import PartFrames
 from articulate_ssl.inference.pose_network import PoseNetwork
@@ -130,6 +131,7 @@ class PoseEstimator(Proposals):
             self.object_frame,
             inference.proportions,
         )
+        self.other_hinges = OtherHinges(self.final, self.hinge_sides.camera)
 
     @property
     def reads_dense(self) -> bool:
@@ -234,7 +236,7 @@ class PoseEstimator(Proposals):
             if registers and fits:
                 before = self.final.distance(chosen, points)
                 chosen, other, margin = self.final.within_limits(chosen, other, margin, points, dense)
-                chosen, other, margin, votes = self._hinged_as_fits(chosen, other, margin, votes, points, dense)
+                chosen, other, margin, votes = self.other_hinges.sought(chosen, other, margin, votes, points, dense)
                 if self.view_search.parts is not None and self.object_frame.learnt and dense is not None:
                     turn = (chosen.base[:, 0, :3, :3] @ self.object_frame.axes).mT
                     votes = self.view_search.parts.beside(votes, dense, turn)
@@ -246,45 +248,6 @@ class PoseEstimator(Proposals):
                 chosen = self.front_ends.placed(chosen, self.object_frame, category, dense, found.dense_part_id)
                 found = self._packaged(chosen, points, margin, votes, dense)
             return found, rival, found.reconstruction_error if before is None else before
-
-    def _hinged_as_fits(
-        self,
-        one: Hypotheses,  # H = 1, in the clouds' proportions
-        rival: Hypotheses,  # H = 1
-        margin: Tensor,  # [B]
-        votes: Votes | None,
-        points: Tensor,  # [B, N, 3]
-        dense: Tensor | None,  # [B, P, 3]
-    ) -> tuple[Hypotheses, Hypotheses, Tensor, Votes | None]:  # H = 1, H = 1, [B]
-        """Explanations, or what views say of objects that are hinged otherwise, where that fits better.
-
-        Few of the simulated views lie, as few objects are hinged elsewhere than most, and a view of such an object is
-        often more like one of the many others. Once either has the cloud's proportions, errors tell
-        (docs/experiments.md, step 242).
-        """
-        views, camera = self.view_search, self.hinge_sides.camera
-        if not (views.learnt and camera.learnt):
-            return one, rival, margin, votes
-        first, lies = one, camera.stood(one.base[:, 0, :3, :3])[1] > 0
-        shown = camera.stood(views.base[:, :3, :3].to(points))[1] > 0
-        for lying in (False, True):
-            rows, among = (lies != lying).nonzero()[:, 0], (shown == lying).nonzero()[:, 0]
-            if not len(rows) or not len(among):
-                continue
-            own = points[rows]
-            seen = views.search(own, shown=among)
-            start = self.articulated.category_at(seen.base[:, :1], seen.state[:, :1])
-            tried, _ = self.registration.registered(start, own)
-            tried = self.final.in_proportion(tried, own, None if dense is None else dense[rows])
-            error, before = self.final.distance(tried, own), self.final.distance(first.rows(rows), own)
-            sought = (camera.stood(tried.base[:, 0, :3, :3])[1] > 0) == lying
-            fits = (sought & self.states.contains(tried.state[:, 0]) & (error < before)).nonzero()[:, 0]
-            better = rows[fits]
-            one, rival = one.with_rows(better, tried.rows(fits)), rival.with_rows(better, first.rows(better))
-            margin = margin.index_copy(0, better, 1 - error[fits] / before[fits])
-            share = votes.share.index_copy(0, better, seen.votes.share[fits])
-            votes = Votes(votes.points, share)
-        return one, rival, margin, votes
 
     def _as_most_are(
         self,
@@ -496,7 +459,7 @@ class PoseEstimator(Proposals):
     ) -> tuple[Prediction, Tensor]:
         """Explanations in the clouds' proportions, packaged; and their errors [B] before that."""
         shown, rival, margin = self.final.within_limits(one, rival, margin, points, dense)
-        shown, _, margin, votes = self._hinged_as_fits(shown, rival, margin, votes, points, dense)
+        shown, _, margin, votes = self.other_hinges.sought(shown, rival, margin, votes, points, dense)
         return self._packaged(shown, points, margin, votes, dense), self.final.distance(one, points)
 
     def _packaged(

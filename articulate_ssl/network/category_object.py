@@ -14,7 +14,7 @@ from articulate_ssl.geometry.kinematic_chain import KinematicChain, extract_chai
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.ops.farthest_point import farthest_point_order
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
-from articulate_ssl.shape.joints import Joints, pair_of_joints
+from articulate_ssl.shape.joints import Joints, category_chain, pair_of_joints
 from articulate_ssl.shape.stretch import principal_directions
 
 _START_SIZE = 0.2  # standard deviation of a part's points before anything is learnt; objects have diagonal 1
@@ -140,9 +140,7 @@ class CategoryObject(nn.Module):
         Raises:
             ValueError: if its tree hangs otherwise than this category's would, by which poses and states are told.
         """
-        joined = torch.zeros_like(self.confidence)
-        joined[pair_of_joints(shape.joints.chain)] = _FOUND
-        if (tree := extract_chain(joined, self.num_parts)) != shape.joints.chain:
+        if (tree := category_chain(shape.joints.chain)) != shape.joints.chain:
             raise ValueError(f"the tree is {shape.joints.chain}, the category's would be {tree}: rename its parts")
         shape_points = self.template.shape[1]
         for part in range(self.num_parts):
@@ -153,8 +151,9 @@ class CategoryObject(nn.Module):
             self.assembly[part] = center
             self.template[part] = thinned - center
             self.principal_axes[part] = principal_directions(thinned)
+        self.confidence.zero_()
         for j, pair in enumerate(pair_of_joints(shape.joints.chain)):
             self.axis[pair] = shape.joints.axis[j]
             self.pivot[pair] = shape.joints.pivot[j]
-        self.confidence.copy_(joined)
+            self.confidence[pair] = _FOUND
         self.mean_confidence.copy_(self.confidence)

@@ -8,7 +8,7 @@ import roma
 import torch
 from torch import Tensor
 
-from articulate_ssl.geometry.kinematic_chain import KinematicChain, pair_index
+from articulate_ssl.geometry.kinematic_chain import KinematicChain, extract_chain, pair_index
 from articulate_ssl.geometry.screw import REVOLUTE, screw_motion
 
 
@@ -83,6 +83,13 @@ def pair_of_joints(chain: KinematicChain) -> list[int]:
     """For every joint the row of `pair_index` that names the two parts it connects."""
     index = {tuple(pair): e for e, pair in enumerate(pair_index(chain.num_parts).tolist())}
     return [index[min(p, c), max(p, c)] for p, c in zip(chain.parent, chain.child, strict=True)]
+
+
+def category_chain(chain: KinematicChain) -> KinematicChain:
+    """The tree that a category makes of the same pairs of parts (`extract_chain`): its root and order may be others."""
+    joined = torch.zeros(len(pair_index(chain.num_parts)))
+    joined[pair_of_joints(chain)] = 1
+    return extract_chain(joined, chain.num_parts)
 
 
 def stacked(values: list[Tensor], like: Tensor) -> Tensor:

@@ -3,8 +3,8 @@
 A category has one joint, so discovery lays hinges over each other, and an oven that is hinged at its side lies on it
 (`inference.hinge_sides`). A camera sees none lie, so views of it are to be simulated as it stands. As of predictions,
 the body says how, and nothing of the door is shown; but here few clouds teach enough: those that discovery explains
-best are all of objects that are hinged as most are, as one that lies has other proportions than most. Of 120 ovens a
-network that saw 142 clouds of them found all 14 clouds of the eight that lie, in one round of lessons
+best are nearly all of objects that are hinged as most are, as one that lies has other proportions than most. Of 120
+ovens a network that saw the best 144 clouds found all 14 clouds of the eight that lie, in one round of lessons
 (docs/experiments.md, step 240).
 """
 

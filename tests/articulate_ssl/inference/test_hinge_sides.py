@@ -1,74 +1,31 @@
 """A box that lies on its side stands up: its parts and joint stay where they are, its frame turns."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 import roma
 import torch
+from boxes_with_doors import HINGE, PIVOT, QUARTER, ZERO, TopIsUp, box_parts, box_shape, box_sides, lying_boxes
 from tiny import POINTS, tiny_module
 
-from articulate_ssl.discovery.registered_shape import RegisteredShape
-from articulate_ssl.geometry.kinematic_chain import KinematicChain
-from articulate_ssl.geometry.screw import PRISMATIC, REVOLUTE, screw_motion
+from articulate_ssl.geometry.screw import REVOLUTE, screw_motion
 from articulate_ssl.geometry.se3 import se3, transform_points
 from articulate_ssl.inference.hinge_sides import BODY_SIZE, DOOR_SIZE, TURNS, Bodies, HingeSides, turned_about
 from articulate_ssl.inference.part_frames import PartFrames
 from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.inference.surface_decision import LOOKS, SIZE, SurfaceDecision
 from articulate_ssl.network.surface_network import SurfaceSize
-from articulate_ssl.shape.articulated_shape import ArticulatedShape
-from articulate_ssl.shape.joints import Joints
-from articulate_ssl.training import hinge_lessons, lying_scans
+from articulate_ssl.training import hinge_lessons
 from articulate_ssl.training.hinge_lessons import learn_hinge_sides
-from articulate_ssl.training.lying_scans import quarters_to_stand
 
 TINY = SurfaceSize(read=48, centers=32, dims=(8, 8), radii=(0.3, 0.5), num_neighbors=8, global_dim=16, head_dim=16)
-QUARTER = math.pi / 2
-ZERO = -1.9  # joint state at which the door is closed
-HINGE, PIVOT = torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 0.3, -0.26])  # opens outwards
-BODY, DOOR = torch.tensor([0.6, 0.6, 0.5]), torch.tensor([0.6, 0.6, 0.02])
-
-
-def _on_box(size: torch.Tensor, count: int, generator: torch.Generator) -> torch.Tensor:
-    """Points [count, 3] on the surface of a box about the origin."""
-    points = torch.rand(count, 3, generator=generator) - 0.5
-    side = torch.arange(count) % 3
-    rows = torch.arange(count)
-    points[rows, side] = points[rows, side].sign() / 2
-    return points * size
-
-
-def _parts(generator: torch.Generator, count: int, up: int = 1) -> tuple[torch.Tensor, torch.Tensor]:
-    """Points of the body, with something on its top (+y, or +x), and of the closed door at its front (-z)."""
-    place, size = torch.tensor([0.0, 0.34, 0.1]), torch.tensor([0.3, 0.08, 0.2])
-    order = [1, 0, 2] if up == 0 else [0, 1, 2]
-    top = place[order] + _on_box(size[order], count // 5, generator)
-    body = torch.cat([_on_box(BODY, count - count // 5, generator), top])
-    return body, _on_box(DOOR, count // 3, generator) + torch.tensor([0.0, 0.0, -0.26])
-
-
-def _shape() -> ArticulatedShape:
-    body, door = _parts(torch.Generator().manual_seed(0), 600)
-    opened = screw_motion(HINGE, PIVOT, torch.tensor(-ZERO), REVOLUTE)
-    points = torch.cat([body, transform_points(opened, door)])
-    label = torch.tensor([0] * len(body) + [1] * len(door))
-    joints = Joints(KinematicChain(2, 0, (0,), (1,)), HINGE[None], PIVOT[None], REVOLUTE)
-    return ArticulatedShape(points, label, joints)
-
-
-def _sides() -> HingeSides:
-    sides = HingeSides()
-    # Seen in training with the door open by 50 to 100 degrees.
-    sides.measure(_shape(), torch.tensor([[ZERO + 0.9, ZERO + 1.8]]))
-    return sides
 
 
 def test_faces_say_when_the_door_is_closed():
     """To a fraction of a degree, though the joint is believed to be tilted; boxes about points then are off."""
-    shape = _shape()
+    shape = box_shape()
     tilt = roma.rotvec_to_rotmat(torch.tensor([0.0, 0.1, -0.1]))
     believed = replace(shape, joints=replace(shape.joints, axis=HINGE[None] @ tilt.mT))
     frames = PartFrames(2)
@@ -83,68 +40,6 @@ def test_faces_say_when_the_door_is_closed():
     assert abs(float(sides.closed) - ZERO) < 0.005
     assert abs(float(by_boxes.closed) - ZERO) > 0.005
     torch.testing.assert_close(sides.axes, torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]), atol=1e-5, rtol=0)
-
-
-class _TopIsUp(torch.nn.Module):
-    """Looks right to it what has more above: its mean, where points count from, is nearer to its upper end."""
-
-    def __init__(self, up: int = 1, size: SurfaceSize = BODY_SIZE):
-        super().__init__()
-        self.size = size
-        self.up = up
-        self.register_buffer("temperature", torch.tensor(1.0))
-
-    def seen(self, cloud):
-        up = cloud.points[..., self.up]
-        return -2000 * (up.amax(dim=1) + up.amin(dim=1))
-
-
-def _lying(
-    quarters: list[int],  # by which the frame of each of B objects is to be turned
-    opened: float = 1.2,
-    up: int = 1,
-    knob: bool = False,  # at the upper end of the door, +x
-) -> tuple[Prediction, torch.Tensor, torch.Tensor]:
-    """Predictions by the one joint there is, dense clouds, and the true rotations canonical -> camera."""
-    generator, shape = torch.Generator().manual_seed(3), _shape()
-    count = len(quarters)
-    body, door = _parts(generator, 3000, up)
-    if knob:
-        at = torch.tensor([0.2, 0.0, -0.28])
-        door = torch.cat([door, at + _on_box(torch.tensor([0.1, 0.1, 0.02]), 300, generator)])
-    base = se3(roma.random_rotmat(count), torch.rand(count, 3, generator=generator))
-    state = torch.full((count, 1), ZERO + opened)
-    sides = _sides()
-    turn = roma.rotvec_to_rotmat(torch.tensor(quarters)[:, None] * QUARTER * sides.axes[:, 2])
-    motion = screw_motion(HINGE, PIVOT, torch.tensor(opened), REVOLUTE)
-    dense = torch.cat([body @ turn.mT, transform_points(motion, door @ turn.mT)], dim=1)
-    dense = transform_points(base, dense[:, torch.randperm(dense.shape[1], generator=generator)])
-    rest = shape.points.view(1, -1, 3)
-    parts = [rest[:, shape.label == k][:, :200].expand(count, -1, -1) for k in range(2)]
-    center = torch.stack([part.mean(dim=1) for part in parts], dim=1)
-    pose = shape.joints.part_pose(base, state)
-    part_pose = pose.clone()
-    part_pose[..., :3, 3] = transform_points(pose, center[:, :, None])[:, :, 0]
-    line = torch.zeros(count, 1, dtype=torch.long)
-    prediction = Prediction(
-        part_id=torch.zeros(count, 4, dtype=torch.long),
-        part_probability=torch.ones(count, 4, 2) / 2,
-        part_pose=part_pose,
-        part_shape=torch.stack(parts, dim=1) - center[:, :, None],
-        assembly=center,
-        base_pose=base,
-        joint_parent=line,
-        joint_child=line + 1,
-        joint_type=line,
-        joint_axis=(base[:, None, :3, :3] @ HINGE[:, None]).squeeze(-1),
-        joint_pivot=transform_points(base, PIVOT.expand(count, 1, 3)),
-        joint_state=state,
-        canonical_axis=HINGE.expand(count, 1, 3),
-        canonical_pivot=PIVOT.expand(count, 1, 3),
-        reconstruction_error=torch.ones(count),
-        margin=torch.ones(count),
-    )
-    return prediction, dense, base[:, :3, :3] @ turn
 
 
 def _posed(prediction: Prediction) -> torch.Tensor:
@@ -170,7 +65,7 @@ def _same_in_camera_space(one: Prediction, other: Prediction) -> None:
 
 
 def test_the_closed_door_is_square_to_the_body_and_near_it():
-    sides = _sides()
+    sides = box_sides()
     assert float(sides.closed) == pytest.approx(ZERO, abs=0.02)
     torch.testing.assert_close(sides.axes[:, 2], torch.tensor([0.0, 0.0, 1.0]), atol=0.03, rtol=0)
     torch.testing.assert_close(sides.door, torch.tensor([0.0, 0.0, -0.26]), atol=0.02, rtol=0)
@@ -178,18 +73,18 @@ def test_the_closed_door_is_square_to_the_body_and_near_it():
 
 
 def test_states_count_from_the_closed_door():
-    prediction, _, _ = _lying([0, 1, 2])
-    counted = _sides().counted_from_closed(prediction)
+    prediction, _, _ = lying_boxes([0, 1, 2])
+    counted = box_sides().counted_from_closed(prediction)
     _same_in_camera_space(counted, prediction)
     _holds(counted)
     torch.testing.assert_close(counted.joint_state, torch.full((3, 1), 1.2), atol=0.02, rtol=0)
-    closed = _sides().counted_from_closed(_lying([0], opened=0.0)[0])
+    closed = box_sides().counted_from_closed(lying_boxes([0], opened=0.0)[0])
     turned = roma.rotmat_geodesic_distance(closed.part_pose[:, 0, :3, :3], closed.part_pose[:, 1, :3, :3])
     assert float(turned) < 0.02
 
 
 def test_a_turned_frame_leaves_everything_where_it_is():
-    prediction, _, _ = _lying([0, 1, 2, 3])
+    prediction, _, _ = lying_boxes([0, 1, 2, 3])
     normal = prediction.base_pose[:, :3, 2]
     turned = turned_about(prediction, normal, torch.arange(4))
     _same_in_camera_space(turned, prediction)
@@ -200,9 +95,9 @@ def test_a_turned_frame_leaves_everything_where_it_is():
 
 
 def test_a_lying_object_stands_up():
-    prediction, dense, true = _lying([0, 1, 2, 3])
-    sides = _sides()
-    sides.surface = _TopIsUp()
+    prediction, dense, true = lying_boxes([0, 1, 2, 3])
+    sides = box_sides()
+    sides.surface = TopIsUp()
     decided, _ = sides.decided(sides.counted_from_closed(prediction), dense)
     _same_in_camera_space(decided, prediction)
     _holds(decided)
@@ -221,11 +116,11 @@ def test_a_lying_object_stands_up():
 
 @pytest.mark.parametrize(("doors", "likelier", "turns"), [(False, 2.1, 1), (False, 1.9, 0), (True, 0.1, 2)])
 def test_what_is_undecided_of_a_body_stays_and_doors_are_believed(doors, likelier, turns):
-    prediction, dense, _ = _lying([2] if doors else [1], knob=doors)
-    sides = _sides()
+    prediction, dense, _ = lying_boxes([2] if doors else [1], knob=doors)
+    sides = box_sides()
     sides.doors.fill_(doors)
     sides.closed.zero_()
-    sides.surface = _TopIsUp(up=0, size=DOOR_SIZE) if doors else _TopIsUp()
+    sides.surface = TopIsUp(up=0, size=DOOR_SIZE) if doors else TopIsUp()
     looks = sides.looks_right(sides.bodies(prediction, dense, (dense,)))[0]
     sides.log_prior.fill_(-1e6)
     sides.log_prior[:2] = likelier * torch.arange(2.0) - looks[:2]
@@ -237,11 +132,11 @@ def test_what_is_undecided_of_a_body_stays_and_doors_are_believed(doors, likelie
 
 @pytest.mark.parametrize("opened", [0.3, 1.2, 2.2])
 def test_upside_down_is_told_by_doors_too(opened):
-    prediction, dense, true = _lying([0, 2, 2], opened, knob=True)
-    sides = _sides()
+    prediction, dense, true = lying_boxes([0, 2, 2], opened, knob=True)
+    sides = box_sides()
     sides.doors.fill_(True)
     sides.closed.zero_()
-    sides.surface = _TopIsUp(up=0, size=DOOR_SIZE)
+    sides.surface = TopIsUp(up=0, size=DOOR_SIZE)
     decided, _ = sides.decided(sides.counted_from_closed(prediction), dense)
     _same_in_camera_space(decided, prediction)
     off = roma.rotmat_geodesic_distance(decided.base_pose[:, :3, :3], true).rad2deg()
@@ -251,9 +146,9 @@ def test_upside_down_is_told_by_doors_too(opened):
 @pytest.mark.parametrize("opened", [1.2, 2.2])
 def test_nothing_seen_of_a_door_says_how_its_prediction_leans(opened):
     """Nor how open it is believed to be, nor how long."""
-    sides = _sides()
+    sides = box_sides()
     sides.doors.fill_(True)
-    prediction, dense, _ = _lying([0], opened, knob=True)
+    prediction, dense, _ = lying_boxes([0], opened, knob=True)
     bodies = sides.bodies(prediction, dense, (dense, dense + 0.001))
     assert bodies.known.all() and bodies.points.shape == (2, 1, LOOKS * DOOR_SIZE.read, 3)
     door = prediction.part_pose[0, 1, :3, :3] @ screw_motion(HINGE, PIVOT, torch.tensor(ZERO), REVOLUTE)[:3, :3].mT
@@ -275,9 +170,9 @@ def test_nothing_seen_of_a_door_says_how_its_prediction_leans(opened):
 
 @pytest.mark.parametrize(("count", "known"), [(300, True), (200, False)])
 def test_a_door_of_few_points_is_looked_at_again_and_of_fewer_not_at_all(count, known):
-    sides = _sides()
+    sides = box_sides()
     sides.doors.fill_(True)
-    prediction, dense, _ = _lying([0], 2.2)
+    prediction, dense, _ = lying_boxes([0], 2.2)
     own = sides._doors(prediction, dense, sides._boxes(prediction.base_pose, dense)[:, :, 0])[1]
     behind = ((dense - prediction.base_pose[:, None, :3, 3]) @ prediction.base_pose[:, :3, 2:3]).squeeze(-1) > 0
     some = torch.cat([dense[own][:count], dense[~own & behind]])[None]
@@ -294,10 +189,10 @@ def test_a_door_of_few_points_is_looked_at_again_and_of_fewer_not_at_all(count, 
 def test_of_doors_it_does_not_show_at_which_side_a_hinge_is():
     """What looks right is the same of a door and of its mirror image, whatever the network."""
     torch.manual_seed(0)
-    sides = _sides()
+    sides = box_sides()
     sides.doors.fill_(True)
     sides.surface = SurfaceDecision(TINY).requires_grad_(False)
-    prediction, dense, _ = _lying([0, 2], knob=True)
+    prediction, dense, _ = lying_boxes([0, 2], knob=True)
     bodies = sides.bodies(prediction, dense, (dense,))
     mirror = torch.diag(torch.tensor([1.0, -1.0, 1.0]))
     across = bodies.frames[:, 0] @ mirror @ bodies.frames[:, 0].mT  # camera space
@@ -316,11 +211,11 @@ def test_of_doors_it_does_not_show_at_which_side_a_hinge_is():
 
 def test_nothing_seen_of_a_body_says_where_its_door_is():
     """However wide it is open, and although the prediction is tilted: frames are square to the box, points its own."""
-    sides = _sides()
+    sides = box_sides()
     seen = []
     for opened in (0.3, 1.2, 2.2):
         torch.manual_seed(0)
-        prediction, dense, true = _lying([0], opened)
+        prediction, dense, true = lying_boxes([0], opened)
         tilt = se3(roma.rotvec_to_rotmat(torch.tensor([[0.12, 0.05, -0.06]])), torch.zeros(1, 3))
         prediction = turned_about(prediction, prediction.base_pose[:, :3, 2], torch.zeros(1))
         tilted = Prediction(**{**prediction.__dict__, "base_pose": prediction.base_pose @ tilt})
@@ -342,9 +237,9 @@ def test_nothing_seen_of_a_body_says_where_its_door_is():
 
 
 def test_where_too_little_is_behind_the_door_nothing_is_decided():
-    prediction, dense, _ = _lying([1, 1])
-    sides = _sides()
-    sides.surface = _TopIsUp()
+    prediction, dense, _ = lying_boxes([1, 1])
+    sides = box_sides()
+    sides.surface = TopIsUp()
     for count in (700, 300):
         kept, _ = sides.decided(prediction, dense[:, :count])
         torch.testing.assert_close(kept.base_pose, prediction.base_pose)
@@ -353,18 +248,18 @@ def test_where_too_little_is_behind_the_door_nothing_is_decided():
 
 @pytest.fixture
 def box_module(monkeypatch):
-    """A module that ever learns the same of its lessons: `_TopIsUp`."""
+    """A module that ever learns the same of its lessons: `TopIsUp`."""
     module = tiny_module(num_parts=2).eval()
     monkeypatch.setattr(hinge_lessons, "FEWEST", 20)
-    monkeypatch.setattr(hinge_lessons, "teach", lambda *_: _TopIsUp())
+    monkeypatch.setattr(hinge_lessons, "teach", lambda *_: TopIsUp())
     monkeypatch.setattr(hinge_lessons, "_predictions", lambda *_: [])
     return module
 
 
 def _drawn(quarters: torch.Tensor, up: int = 1) -> Bodies:
-    body = _parts(torch.Generator().manual_seed(0), 3000, up)[0]
+    body = box_parts(torch.Generator().manual_seed(0), 3000, up)[0]
     body = body[torch.randperm(len(body), generator=torch.Generator().manual_seed(1))[: LOOKS * SIZE.read]]
-    axes = _sides().axes
+    axes = box_sides().axes
     turn = roma.rotvec_to_rotmat(quarters[:, None] * QUARTER * axes[:, 2])
     points = (body @ turn.mT)[None]
     steps = roma.rotvec_to_rotmat(torch.arange(TURNS)[:, None] * torch.tensor([0.0, 0.0, QUARTER]))
@@ -399,7 +294,7 @@ def _seen_by_an_upright_camera(lying: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize(("share", "learnt"), [(0.12, True), (0.0, False), (0.6, False)], ids=["some", "none", "most"])
 def test_an_upright_camera_needs_no_network(monkeypatch, share, learnt):
     lying = (torch.rand(200, generator=torch.Generator().manual_seed(2)) < share).float()
-    poses, known = _seen_by_an_upright_camera(lying), _sides()
+    poses, known = _seen_by_an_upright_camera(lying), box_sides()
     module = tiny_module(num_parts=2, orientation_range=100.0).eval()
     monkeypatch.setattr(hinge_lessons, "FEWEST", 20)
     monkeypatch.setattr(hinge_lessons, "_predictions", lambda *_: [SimpleNamespace(base_pose=poses)])
@@ -409,7 +304,7 @@ def test_an_upright_camera_needs_no_network(monkeypatch, share, learnt):
     sides = module.hinge_sides
     assert bool(sides.learnt) == bool(sides.camera.learnt) == learnt
     if learnt:
-        prediction, _, _ = _lying([0, 0])
+        prediction, _, _ = lying_boxes([0, 0])
         rows = torch.tensor([int(lying.argmin()), int(lying.argmax())])
         stood, quarters = sides.decided(replace(prediction, base_pose=poses[rows]), None)
         assert quarters.tolist() == [0, 3]
@@ -418,7 +313,7 @@ def test_an_upright_camera_needs_no_network(monkeypatch, share, learnt):
 
 def test_of_simulated_views_it_is_known_which_lie(monkeypatch):
     lying = (torch.rand(200, generator=torch.Generator().manual_seed(2)) < 0.12).float()
-    poses, known = _seen_by_an_upright_camera(lying), _sides()
+    poses, known = _seen_by_an_upright_camera(lying), box_sides()
     monkeypatch.setattr(hinge_lessons, "FEWEST", 20)
     monkeypatch.setattr(hinge_lessons, "_predictions", None)  # nothing is asked
     monkeypatch.setattr(HingeSides, "measure", lambda self, *_: self.axes.copy_(known.axes))
@@ -430,48 +325,8 @@ def test_of_simulated_views_it_is_known_which_lie(monkeypatch):
         assert bool(module.hinge_sides.learnt) == bool(module.hinge_sides.camera.learnt) == learnt
 
 
-def _scans(quarters: list[int], opened: Sequence[float]) -> tuple[RegisteredShape, torch.Tensor, torch.Tensor]:
-    """Scans of objects that lie by so many quarters, registered; their clouds, and how canonical space truly stands."""
-    prediction, dense, stands = _lying(quarters)
-    state = ZERO + torch.tensor(opened)[:, None]
-    error = torch.arange(len(quarters)).float()
-    found = RegisteredShape(_shape(), prediction.base_pose, state, torch.zeros(len(quarters), 2, 3), error)
-    return found, dense, stands
-
-
-@pytest.fixture
-def few_scans(monkeypatch):
-    monkeypatch.setattr(lying_scans, "_FEWEST", 10)
-    monkeypatch.setattr(lying_scans, "teach", lambda *_: _TopIsUp())
-
-
-def test_scans_that_lie_are_found_and_stood_up(few_scans):
-    """Whether they fit well or not; but where the joint is beyond where others are, nothing is believed."""
-    quarters = [0] * 14 + [3] + [0, 3, 1, 2, 3]
-    opened = [0.8, 1.0, 1.2, 1.4, 1.6] * 3 + [1.2] * 4 + [3.0]
-    found, dense, stands = _scans(quarters, opened)
-    told, turn = quarters_to_stand(found, dense, torch.arange(15))
-    assert told.tolist() == [*quarters[:-1], 0]
-    torch.testing.assert_close((found.base[:, :3, :3] @ turn)[:-1], stands[:-1], atol=1e-4, rtol=0)
-    torch.testing.assert_close(turn[-1], torch.eye(3))
-
-
-def test_scans_stay_where_bodies_do_not_tell(few_scans, monkeypatch):
-    found, dense, _ = _scans([0, 2, 1, 3] * 4, [1.2] * 16)  # half of those that are left out seem to lie
-    assert quarters_to_stand(found, dense, torch.arange(16))[0].tolist() == [0] * 16
-    found, dense, _ = _scans([3] * 2 + [0] * 14, [1.2] * 16)
-    assert quarters_to_stand(found, dense, torch.arange(2, 16))[0].tolist() == [3] * 2 + [0] * 14
-    monkeypatch.setattr(lying_scans, "teach", None)  # nothing is taught
-    for best, cloud in ((torch.arange(9), dense), (torch.arange(16), dense[:, :600])):
-        told, turn = quarters_to_stand(found, cloud, best)
-        assert told.tolist() == [0] * 16
-        torch.testing.assert_close(turn, torch.eye(3).expand(16, 3, 3))
-    slides = replace(found, shape=replace(found.shape, joints=replace(found.shape.joints, joint_type=PRISMATIC)))
-    assert quarters_to_stand(slides, dense, torch.arange(16))[0].tolist() == [0] * 16
-
-
 def test_a_few_points_of_the_body_do_not_make_the_door_another():
-    shape = _shape()
+    shape = box_shape()
     label = shape.label.clone()
     label[:480:60] = 1
     sides = HingeSides()
@@ -491,7 +346,7 @@ def test_lessons_turn_what_the_network_disagrees_with(box_module, monkeypatch):
     quarters = torch.where(torch.rand(200, generator=torch.Generator().manual_seed(2)) < 0.12, 1, 0)
     monkeypatch.setattr(hinge_lessons, "_bodies", lambda _, clouds, __: _drawn(quarters[: len(clouds)]))
     given = []
-    monkeypatch.setattr(hinge_lessons, "teach", lambda lessons, *_: given.append(lessons) or _TopIsUp())
+    monkeypatch.setattr(hinge_lessons, "teach", lambda lessons, *_: given.append(lessons) or TopIsUp())
     learn_hinge_sides(box_module, torch.zeros(200, POINTS, 3))
     first, *later = (lessons.frames[:, 0] for lessons in given)
     assert len(later) == 2 and (first == first[0]).all()  # as all are predicted
@@ -510,7 +365,7 @@ def test_doors_are_shown_where_all_bodies_seem_to_stand_alike(box_module, monkey
         return _drawn(quarters[: len(clouds)] * (0 if hidden and not sides.doors else 1), up)
 
     monkeypatch.setattr(hinge_lessons, "_bodies", seen)
-    monkeypatch.setattr(hinge_lessons, "teach", lambda lessons, *_: given.append(lessons) or _TopIsUp(up))
+    monkeypatch.setattr(hinge_lessons, "teach", lambda lessons, *_: given.append(lessons) or TopIsUp(up))
     learn_hinge_sides(box_module, torch.zeros(200, POINTS, 3))
     assert sides.learnt and bool(sides.doors) == hidden
     assert [lessons.mirrored for lessons in given] == [False] * 3 + [True] * hidden
@@ -557,7 +412,7 @@ def test_predictions_count_from_the_closed_door_with_and_without_a_dense_cloud()
     sides.learnt.fill_(True)
     sides.closed.fill_(0.4)
     sides.door.copy_(torch.tensor([0.0, 0.0, -9.0]))  # all is behind it
-    sides.surface = _TopIsUp()
+    sides.surface = TopIsUp()
     alone, after = module.predict_points(clouds), module.predict_points(clouds, dense=dense)
     for prediction in (alone, after):
         torch.testing.assert_close(prediction.joint_state, before.joint_state - 0.4, atol=1e-5, rtol=0)

@@ -192,7 +192,8 @@ def test_what_is_hinged_otherwise_is_sought_among_its_own_views_and_believed_whe
     one = estimator.final.in_proportion(one, points, data.points)
     votes = estimator.view_search.search(points).votes
     votes = votes._replace(share=torch.full_like(votes.share, 0.5))
-    found, rival, margin, said = estimator._hinged_as_fits(one, one, torch.full((3,), 2.0), votes, points, data.points)
+    sought = estimator.other_hinges.sought
+    found, rival, margin, said = sought(one, one, torch.full((3,), 2.0), votes, points, data.points)
     if not known:
         assert found is one and said is votes and not camera.asked
         return
