@@ -6,13 +6,15 @@ turned in front of the camera (`view_orientations`). What teaches the network ar
 (`simulated_views`), whose poses and states are known. No label is used; which scans show the same object is.
 
 Canonical space lays hinges over each other, so that an object that is hinged at another side than most lies there.
-Before views of it are simulated it is stood up: what teaches shows it as cameras do, and says that it lies.
+Before views of it are simulated it is stood up: what teaches shows it as cameras do, and says that it lies. It is shown
+in the mirror, too: who is hinged at one side may be at the other, which few scans show, or none.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -26,6 +28,7 @@ from articulate_ssl.discovery.synchronization import standing_margins, unit_boxe
 from articulate_ssl.discovery.view_orientations import find_view_orientations
 from articulate_ssl.geometry.orientation_range import OrientationRange
 from articulate_ssl.geometry.rotation_group import rotation_group
+from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.ops.denormals import flush_denormals
 from articulate_ssl.ops.progress import Stage, announce
 
@@ -66,8 +69,8 @@ def discover_from_scans(
     quarters = torch.zeros(len(clouds), dtype=torch.long)
     if orientation.limited:
         quarters, lying = to_stand(found, clouds, best)
-    best = best[quarters[best] == 0]
-    kept = torch.cat([best, quarters.nonzero()[:, 0]])
+    best, lie = best[quarters[best] == 0], quarters.nonzero()[:, 0]
+    kept = torch.cat([best, lie, lie])
     turns = OrientationRange().draw(len(kept) * _VIEWS, generator)
     if orientation.limited:
         _announce(0, "how objects are turned")
@@ -76,8 +79,11 @@ def discover_from_scans(
         stand = find_view_orientations(views, seen, shown.base[:, :3, :3])
         found = found.turned(stand.mean)
         turns = stand.draw(len(turns), orientation, generator).unflatten(0, (-1, _VIEWS))
-        turns = turns @ (stand.mean @ lying[kept].mT @ stand.mean.mT)[:, None]
-    found, clouds = found.of_clouds(kept), clouds[kept]
+        lying = torch.cat([lying[best], lying[lie], lying[lie].mT])
+        turns = turns @ (stand.mean @ lying.mT @ stand.mean.mT)[:, None]
+    quarters = torch.cat([quarters[best], quarters[lie], -quarters[lie] % 4])
+    clouds = torch.cat([clouds[best], clouds[lie], _in_the_mirror(found.of_clouds(lie), clouds[lie])])
+    found = replace(found.of_clouds(kept), quarters=quarters)
     _announce(1, "views of the scans")
     turns = turns.reshape(len(kept), _VIEWS, 3, 3)
     simulated = simulate_views(found, clouds, turns, num_points, mean_distance, random, reshape=True)
@@ -95,6 +101,18 @@ def _likeliest(found: RegisteredShape, clouds: Tensor) -> Tensor:  # [n]
         return found.error.argsort()
     boxes, _, _ = unit_boxes(clouds @ found.base[:, :3, :3] @ found.axes[0])
     return standing_margins(boxes, rotation_group(24)).argsort(descending=True)
+
+
+def _in_the_mirror(
+    found: RegisteredShape,  # registered to the clouds
+    clouds: Tensor,  # [n, P, 3]
+) -> Tensor:  # [n, P, 3]
+    """Clouds of the mirror images of objects with one joint: along its axis, so that poses and states are the same."""
+    axis = found.shape.joints.axis[0]
+    along = found.shape.points @ axis
+    middle = (along.min() + along.max()) / 2
+    resting = transform_points(invert_se3(found.base), clouds)
+    return transform_points(found.base, resting - 2 * (resting @ axis - middle)[..., None] * axis)
 
 
 def _announce(done: int, name: str) -> None:

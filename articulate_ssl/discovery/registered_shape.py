@@ -18,6 +18,7 @@ from articulate_ssl.shape.joints import category_chain
 # Joint limits: where nine tenths of the clouds' states lie, and a margin for what few clouds show.
 _LIMIT_QUANTILES = (0.05, 0.95)
 _LIMIT_MARGIN = 0.15  # of the width between them, on either side
+_OF_CLOUDS = ("base", "state", "log_stretch", "error", "beside", "point_part", "quarters")
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,8 @@ class RegisteredShape:
         beside: [n, K, 3] where else parts of each cloud lie, in canonical object space, where they may.
         point_part: [n, N] which part every point of the clouds belongs to, where more than the shape says it.
         labelled: What said it: clouds of whole objects, which stand as canonical object space does.
+        quarters: [n] by how many quarters about the closed door's normal objects are turned until they stand, where
+            canonical space lays hinges over each other and bodies tell (`from_scans`).
     """
 
     shape: ArticulatedShape
@@ -50,6 +53,7 @@ class RegisteredShape:
     beside: Tensor | None = None
     point_part: Tensor | None = None
     labelled: LabelledClouds | None = None
+    quarters: Tensor | None = None
 
     @staticmethod
     def of(fit: InstanceFit, clouds: Tensor) -> RegisteredShape:
@@ -59,7 +63,7 @@ class RegisteredShape:
 
     def of_clouds(self, rows: Tensor | slice) -> RegisteredShape:
         """The same for some of the clouds."""
-        own = {name: getattr(self, name) for name in ("base", "state", "log_stretch", "error", "beside", "point_part")}
+        own = {name: getattr(self, name) for name in _OF_CLOUDS}
         return replace(self, **{name: value[rows] for name, value in own.items() if value is not None})
 
     def fit(self, generator: torch.Generator, rows: Tensor | slice = slice(None)) -> InstanceFit:

@@ -88,6 +88,7 @@ def simulate_views(
         error=found.error[sources] * scale,
         beside=None if found.beside is None else scale[:, None, None] * found.beside[sources],
         point_part=torch.stack(parts),
+        quarters=None if found.quarters is None else found.quarters[sources],
     )
     return torch.from_numpy(np.stack(points)).to(clouds), registered
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from articulate_ssl.inference.candidates import ANOTHER_WAY, angle_to
 from articulate_ssl.inference.final_fit import FinalFit
 from articulate_ssl.inference.upright_camera import UprightCamera
 from articulate_ssl.inference.votes import Votes
@@ -27,6 +28,11 @@ class OtherHinges:
     def __init__(self, final: FinalFit, camera: UprightCamera) -> None:
         self.final, self.camera = final, camera
 
+    @property
+    def known(self) -> bool:
+        """Whether there are views, and it is known which of them lie."""
+        return self.final.view_search.learnt and bool(self.camera.learnt)
+
     def sought(
         self,
         one: Hypotheses,  # H = 1, in the clouds' proportions
@@ -41,25 +47,26 @@ class OtherHinges:
         What gave way is the rival then, and the margin how much worse it fits.
         """
         final, views = self.final, self.final.view_search
-        if not (views.learnt and self.camera.learnt):
+        if not self.known:
             return one, rival, margin, votes
-        first, lies, shown = one, self._lies(one.base[:, 0]), self._lies(views.base.to(points))
+        error, shown = final.distance(one, points), self._lies(views.base.to(points))
         for lying in (False, True):
-            rows, among = (lies != lying).nonzero()[:, 0], (shown == lying).nonzero()[:, 0]
-            if not len(rows) or not len(among):
+            among = (shown == lying).nonzero()[:, 0]
+            if not len(among):
                 continue
-            own, before = points[rows], first.rows(rows)
-            seen = views.search(own, shown=among)
+            seen = views.search(points, shown=among)
             start = final.articulated.category_at(seen.base[:, :1], seen.state[:, :1])
-            tried, _ = final.registration.registered(start, own)
-            tried = final.in_proportion(tried, own, None if dense is None else dense[rows])
-            error, worse = final.distance(tried, own), final.distance(before, own)
+            tried, _ = final.registration.registered(start, points)
+            tried = final.in_proportion(tried, points, dense)
+            tried_error = final.distance(tried, points)
             likely = final.registration.states.contains(tried.state[:, 0]) & (self._lies(tried.base[:, 0]) == lying)
-            fits = (likely & (error < worse)).nonzero()[:, 0]
-            better = rows[fits]
-            one, rival = one.with_rows(better, tried.rows(fits)), rival.with_rows(better, before.rows(fits))
-            margin = margin.index_copy(0, better, 1 - error[fits] / worse[fits])
-            votes = votes._replace(share=votes.share.index_copy(0, better, seen.votes.share[fits]))
+            rows = (likely & (tried_error < error)).nonzero()[:, 0]
+            turned = angle_to(tried.base[:, :, :3, :3], one.base[:, 0, :3, :3])[:, 0] > ANOTHER_WAY
+            gave_way = (likely & (tried_error < error) & turned).nonzero()[:, 0]
+            rival = rival.with_rows(gave_way, one.rows(gave_way))
+            margin = margin.index_copy(0, gave_way, 1 - tried_error[gave_way] / error[gave_way])
+            one, error = one.with_rows(rows, tried.rows(rows)), error.index_copy(0, rows, tried_error[rows])
+            votes = votes._replace(share=votes.share.index_copy(0, rows, seen.votes.share[rows]))
         return one, rival, margin, votes
 
     def _lies(self, base: Tensor) -> Tensor:

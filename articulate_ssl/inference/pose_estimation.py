@@ -204,7 +204,8 @@ class PoseEstimator(Proposals):
         if self.hinge_sides.learnt:
             seen = [self.hinge_sides.counted_from_closed(one) for one in seen]
             seen[0], quarters = self.hinge_sides.decided(seen[0], dense)
-            if fits and (self.inference.refine if refine is None else refine) is not False:
+            registers = (self.inference.refine if refine is None else refine) is not False
+            if fits and registers and not self.other_hinges.known:
                 seen[0] = self._as_most_are(seen[0], quarters, points, dense)
         if not self.handedness.learnt:
             return tuple(seen)

@@ -31,7 +31,7 @@ _NEAREST = 30  # views that are registered to the cloud
 _ALIKE = 60  # views whose objects are turned about as one's, where that is known. Chosen.
 _SCALES, _ROUNDS = (0.08, 0.03), 6  # of that registration
 _VOTING = 5  # of those, with the least errors, that say which parts points are of
-_BUFFERS = ("views", "step", "part", "base", "state")
+_BUFFERS = ("views", "step", "part", "base", "state", "quarters")
 
 
 class Seen(NamedTuple):
@@ -69,6 +69,7 @@ class ViewSearch(nn.Module):
         part: [V, P] uint8, which part their points are of.
         base: [V, 4, 4] canonical object space -> view.
         state: [V, J] joint states.
+        quarters: [V] int64, by how many quarters their objects are turned until they stand (`RegisteredShape`).
         parts: Which part points are of, if views have taught that.
     """
 
@@ -81,6 +82,7 @@ class ViewSearch(nn.Module):
         self.register_buffer("part", torch.zeros(0, _POINTS, dtype=torch.uint8))
         self.register_buffer("base", torch.zeros(0, 4, 4))
         self.register_buffer("state", torch.zeros(0, num_parts - 1))
+        self.register_buffer("quarters", torch.zeros(0, dtype=torch.long))
 
     @property
     def learnt(self) -> bool:
@@ -97,9 +99,17 @@ class ViewSearch(nn.Module):
         base: Tensor,  # [n, 4, 4]
         state: Tensor,  # [n, J]
         part: Tensor,  # [n, N] which part every point is of
+        quarters: Tensor | None = None,  # [n]
     ) -> None:
-        """Keep some of these views, spread evenly."""
-        some = torch.linspace(0, len(views) - 1, min(len(views), _VIEWS)).round().long()
+        """Keep some of these views, spread evenly; but of what lies as many as of what stands, if there are.
+
+        Few objects lie, and what is not shown from about where a camera sees it is taken for another.
+        """
+        quarters = torch.zeros(len(views), dtype=torch.long) if quarters is None else quarters
+        lie, stand = quarters.nonzero()[:, 0], (quarters == 0).nonzero()[:, 0]
+        lie = _evenly(lie, max(_VIEWS // 2, _VIEWS - len(stand)))
+        some = torch.cat([_evenly(stand, _VIEWS - len(lie)), lie])
+        self.quarters = quarters[some].to(self.quarters, copy=True)
         views, step = in_few_bytes(views[some, :_POINTS])
         self.views = views.to(self.views)
         self.part = part[some, :_POINTS].to(self.part, copy=True)
@@ -157,7 +167,9 @@ class ViewSearch(nn.Module):
         return one_hot(part, self.num_parts).to(placed).mean(dim=0)
 
     def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
-        """There are any number of views; weights from before there was a search have none."""
+        """There are any number of views; weights from before there was a search have none, or of none that lie."""
+        views = state_dict.get(f"{prefix}views", self.views)
+        state_dict.setdefault(f"{prefix}quarters", self.quarters.new_zeros(len(views)))
         for name in _BUFFERS:
             own = getattr(self, name)
             value = state_dict.setdefault(prefix + name, own.clone())
@@ -165,3 +177,8 @@ class ViewSearch(nn.Module):
         taught = any(name.startswith(f"{prefix}parts.") for name in state_dict)
         self.parts = ViewParts(self.num_parts).to(self.base).requires_grad_(False) if taught else None
         super()._load_from_state_dict(state_dict, prefix, *rest)
+
+
+def _evenly(rows: Tensor, count: int) -> Tensor:
+    """So many of them, or all."""
+    return rows[torch.linspace(0, len(rows) - 1, min(len(rows), count)).round().long()]

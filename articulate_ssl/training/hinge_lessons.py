@@ -61,7 +61,7 @@ def learn_hinge_sides(
     shape = network.category.articulated_shape(network.joint_type)
     sides.measure(shape, module.states.known, estimator.part_frames)
     if module.orientation.limited:
-        base = views.base if views.learnt else _base_poses(module, clouds[:_VIEWS])
+        base = views.base[views.quarters == 0] if views.learnt else _base_poses(module, clouds[:_VIEWS])
         _learn_upright(sides, base[:, :3, :3])
         return
     predictions = _predictions(module, clouds[:_FIRST])

@@ -112,7 +112,8 @@ class TrainingRecipe(Recipe):
         )
         network.category.adopt(found.shape)
         if self._simulated:
-            self.estimator.view_search.learn(clouds, registered.base, registered.state, registered.point_part)
+            said = registered.base, registered.state, registered.point_part, registered.quarters
+            self.estimator.view_search.learn(clouds, *said)
         if found.axes is not None and not self._simulated:  # in a frame that the clouds share
             shape = network.category.articulated_shape(network.joint_type)
             self.estimator.sliding.learn(shape, found.limits(), clouds[kept], registered.base, found.labelled)

@@ -78,16 +78,34 @@ def test_what_lies_is_seen_as_it_stands_and_said_to_lie(monkeypatch):
     points, found = discover_from_scans(*arguments, orientation, POINTS, to_stand=to_stand)
     assert asked == [list(range(12))]
     turn, _ = roma.rigid_points_registration(truth.shape.points, found.shape.points / found.shape.points.norm())
-    from_mean = roma.rotmat_geodesic_distance(found.base[:, :3, :3], torch.eye(3)[None]).rad2deg()
-    stood = found.base[:, :3, :3] @ turn @ lying @ turn.mT
-    stood_from_mean = roma.rotmat_geodesic_distance(stood, torch.eye(3)[None]).rad2deg()
     # Errors say which cloud a view is of: those of 3 and 15 are 3 and 15 times its scale.
     of = (found.error / found.log_stretch[:, 0, 0].exp()).round(decimals=3)
     source = of / of[of > 0].min()
     lie = (source - 3).abs().lt(0.1) | (source - 15).abs().lt(0.1)
-    assert 30 < lie.sum() <= 2 * from_scans._VIEWS and len(points) > 11 * from_scans._VIEWS
-    assert from_mean[~lie].median() < 45 and stood_from_mean[lie].median() < 45
-    assert from_mean[lie].median() > 75
+    assert torch.equal(lie, found.quarters > 0)
+    assert len(points) > 11 * from_scans._VIEWS
+    for quarters, turned in ((0, torch.eye(3)), (1, lying), (3, lying.mT)):
+        own = found.base[found.quarters == quarters, :3, :3]
+        from_mean, stood_from_mean = (
+            roma.rotmat_geodesic_distance(own @ one, torch.eye(3)[None]).rad2deg().median()
+            for one in (torch.eye(3), turn @ turned @ turn.mT)
+        )
+        assert stood_from_mean < 45 and (from_mean > 75) == bool(quarters)
+        # Two objects, as they are and in the mirror.
+        assert 30 < len(own) <= 2 * from_scans._VIEWS or not quarters
+
+
+def test_in_the_mirror_poses_and_states_are_the_same():
+    data = clouds(LAPTOP, count=4, points=1024)
+    seen = data.points[:, (data.rest[:, 1] < 0.2) | (torch.arange(1024) % 2 == 0)]  # denser at one end of the hinge
+    found = RegisteredShape(true_shape(LAPTOP, data), data.base, data.state, torch.zeros(4, 2, 3), torch.zeros(4))
+    mirrored = from_scans._in_the_mirror(found, seen)
+    posed = found.shape.posed(data.base, data.state)
+    assert nearest_distance(mirrored, posed).max() < 0.06  # as far as between points
+    ends = [((x - x.mean(dim=1, keepdim=True)) * (data.base[:, None, :3, 1])).sum(-1) for x in (seen, mirrored)]
+    torch.testing.assert_close(ends[0], -ends[1], atol=1e-5, rtol=0)
+    assert (torch.cdist(seen, seen) - torch.cdist(mirrored, mirrored)).abs().max() < 1e-3
+    assert torch.linalg.det((mirrored - mirrored.mean(1, True)).mT @ (seen - seen.mean(1, True))).max() < 0
 
 
 def test_chests_that_are_turned_over_are_believed_last():
