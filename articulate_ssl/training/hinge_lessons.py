@@ -19,6 +19,7 @@ from torch import Tensor
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.inference.hinge_sides import DECIDED, Bodies, HingeSides
 from articulate_ssl.inference.prediction import Prediction
+from articulate_ssl.inference.view_search import ViewSearch
 from articulate_ssl.ops.progress import announced, tell
 from articulate_ssl.training.explanations import registered_points, with_noise
 from articulate_ssl.training.surface_lessons import FEWEST, TAUGHT, Lessons, believable, teach
@@ -35,6 +36,7 @@ _VIEWS = 256  # of an upright camera, from which nothing is learnt but a directi
 # Shares of the clouds that the network was not taught by. Chosen: fewer that are turned are not worth a network; more
 # would mean that most are not right; and one that cannot tell sides apart is undecided of many.
 _LEAST_TURNED, _MOST_TURNED, _MOST_UNDECIDED = 0.02, 0.4, 0.15
+# Of simulated views, of which it is known how they lie, the last is the share that a camera takes for others.
 _RARE = 1e-3  # least share of a side
 _SHARES = 50  # rounds of expectation and maximisation
 
@@ -61,8 +63,10 @@ def learn_hinge_sides(
     shape = network.category.articulated_shape(network.joint_type)
     sides.measure(shape, module.states.known, estimator.part_frames)
     if module.orientation.limited:
-        base = views.base[views.quarters == 0] if views.learnt else _base_poses(module, clouds[:_VIEWS])
-        _learn_upright(sides, base[:, :3, :3])
+        if views.learnt:
+            _learn_from_views(sides, views)
+        else:
+            _learn_upright(sides, _base_poses(module, clouds[:_VIEWS])[:, :3, :3])
         return
     predictions = _predictions(module, clouds[:_FIRST])
     if not _seen_enough(_bodies(module, clouds[:_FIRST], predictions)):
@@ -94,7 +98,7 @@ def _base_poses(module: ArticulatedPoseModule, views: Tensor) -> Tensor:
 
 def _learn_upright(
     sides: HingeSides,
-    rotation: Tensor,  # [n, 3, 3] canonical object space -> camera, as views are predicted, or were simulated
+    rotation: Tensor,  # [n, 3, 3] canonical object space -> camera, as views are predicted
 ) -> None:
     """Find out which way is up for an upright camera, and whether some objects do not stand as they are predicted."""
     sides.camera.learn(rotation, sides.axes)
@@ -103,6 +107,20 @@ def _learn_upright(
         other, undecided = float((quarters > 0).double().mean()), float((~stand).double().mean())
         tell(log, "hinge sides, by an upright camera: %.0f %% lie, undecided %.0f %%", 100 * other, 100 * undecided)
         sides.learnt.fill_(_LEAST_TURNED <= other <= _MOST_TURNED and undecided <= _MOST_UNDECIDED)
+    if not sides.learnt:
+        sides.camera.forget()
+
+
+def _learn_from_views(sides: HingeSides, views: ViewSearch) -> None:
+    """The same from simulated views, of which it is known how they lie."""
+    rotation, lie = views.base[:, :3, :3], views.quarters > 0
+    if not lie.any():
+        return
+    sides.camera.learn(rotation[~lie], sides.axes)
+    if sides.camera.learnt:
+        mistaken = float((sides.camera.stood(rotation)[1] != views.quarters).double().mean())
+        tell(log, "hinge sides, by views: %d of %d lie, mistaken %.0f %%", int(lie.sum()), len(lie), 100 * mistaken)
+        sides.learnt.fill_(mistaken <= _MOST_UNDECIDED)
     if not sides.learnt:
         sides.camera.forget()
 

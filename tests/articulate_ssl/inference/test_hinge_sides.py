@@ -311,18 +311,30 @@ def test_an_upright_camera_needs_no_network(monkeypatch, share, learnt):
         torch.testing.assert_close(stood.base_pose[:, :3, 1], torch.tensor([[0.0, 1.0, 0.0]] * 2), atol=1e-5, rtol=0)
 
 
-def test_of_simulated_views_it_is_known_which_lie(monkeypatch):
-    lying = (torch.rand(200, generator=torch.Generator().manual_seed(2)) < 0.12).float()
+@pytest.mark.parametrize(
+    ("share", "right", "orientation", "learnt"),
+    [
+        (0.12, True, 100.0, True),
+        (0.6, True, 100.0, True),
+        (0.0, True, 100.0, False),
+        (0.6, True, 180.0, False),
+        (0.6, False, 100.0, False),
+    ],
+    ids=["some", "most", "none", "any way", "a camera mistakes them"],
+)
+def test_of_simulated_views_it_is_known_which_lie(monkeypatch, share, right, orientation, learnt):
+    lying = (torch.rand(200, generator=torch.Generator().manual_seed(2)) < share).float()
+    # Turned so that they stand: three quarters on.
+    quarters = (3 if right else 1) * lying.long()
     poses, known = _seen_by_an_upright_camera(lying), box_sides()
     monkeypatch.setattr(hinge_lessons, "FEWEST", 20)
     monkeypatch.setattr(hinge_lessons, "_predictions", None)  # nothing is asked
     monkeypatch.setattr(HingeSides, "measure", lambda self, *_: self.axes.copy_(known.axes))
-    for orientation, learnt in ((100.0, True), (180.0, False)):
-        module = tiny_module(num_parts=2, orientation_range=orientation).eval()
-        points, part = torch.rand(200, POINTS, 3), torch.zeros(200, POINTS)
-        module.view_search.learn(points, poses, torch.zeros(200, 1), part)
-        learn_hinge_sides(module, torch.zeros(200, POINTS, 3))
-        assert bool(module.hinge_sides.learnt) == bool(module.hinge_sides.camera.learnt) == learnt
+    module = tiny_module(num_parts=2, orientation_range=orientation).eval()
+    points, part = torch.rand(200, POINTS, 3), torch.zeros(200, POINTS)
+    module.view_search.learn(points, poses, torch.zeros(200, 1), part, quarters)
+    learn_hinge_sides(module, torch.zeros(200, POINTS, 3))
+    assert bool(module.hinge_sides.learnt) == bool(module.hinge_sides.camera.learnt) == learnt
 
 
 def test_a_few_points_of_the_body_do_not_make_the_door_another():
