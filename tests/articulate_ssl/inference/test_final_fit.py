@@ -141,6 +141,20 @@ def test_objects_in_turned_frames_are_hinged_as_most_are_if_that_fits_better(mon
     assert torch.equal(estimator._as_most_are(turned, quarters, points, points).reconstruction_error, error)
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_where_views_show_either_kind_turned_frames_stay(monkeypatch, known):
+    estimator = tiny_module(inference=InferenceOptions(refine=True)).eval().estimator
+    points = torch.rand(2, POINTS, 3, generator=torch.Generator().manual_seed(0))
+    estimator.hinge_sides.learnt.fill_(True)
+    estimator.hinge_sides.camera.learnt.fill_(True)
+    monkeypatch.setattr(type(estimator.other_hinges), "known", known)
+    monkeypatch.setattr(estimator.other_hinges, "sought", lambda *of: of[:4])
+    asked = []
+    monkeypatch.setattr(estimator, "_as_most_are", lambda one, *_: (asked.append(one), one)[1])
+    estimator.predict(points, POINTS, dense=points)
+    assert len(asked) == (not known)
+
+
 def test_candidates_well_beyond_joint_limits_must_fit_much_better_to_be_chosen():
     estimator = tiny_module().eval().estimator
     turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))

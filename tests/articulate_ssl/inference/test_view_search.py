@@ -9,6 +9,7 @@ from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.geometry.orientation_range import OrientationRange
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import se3, transform_points
+from articulate_ssl.inference import view_search
 from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.inference.pose_estimation import PoseEstimator
 from articulate_ssl.inference.upright_camera import UprightCamera
@@ -105,6 +106,26 @@ def test_weights_from_before_there_was_a_search_have_none():
     search = ViewSearch(3)
     search.load_state_dict({})
     assert not search.learnt
+
+
+@pytest.mark.parametrize(("lying", "kept"), [(30, 5), (3, 3), (96, 6), (0, 0)])
+def test_of_what_lies_as_many_views_are_kept_as_of_what_stands(monkeypatch, lying, kept):
+    """As many as there are: states say which they were."""
+    monkeypatch.setattr(view_search, "_VIEWS", 10)
+    quarters = torch.randperm(100, generator=torch.Generator().manual_seed(0)).lt(lying).long() * 3
+    of = torch.rand(100, 20, 3), torch.eye(4).repeat(100, 1, 1), torch.arange(100.0)[:, None]
+    search = ViewSearch(2)
+    search.learn(*of, torch.zeros(100, 20), quarters)
+    rows = search.state[:, 0].long()
+    assert len(rows.unique()) == 10 and (quarters[rows] > 0).sum() == kept
+    assert torch.equal(quarters[rows], search.quarters)
+    if kept > 3:  # spread evenly
+        assert quarters[: rows[-kept]].count_nonzero() == 0 and quarters[rows[-1] + 1 :].count_nonzero() == 0
+    again, earlier = ViewSearch(2), ViewSearch(2)
+    again.load_state_dict(search.state_dict())
+    assert torch.equal(again.quarters, search.quarters)
+    earlier.load_state_dict({name: value for name, value in search.state_dict().items() if name != "quarters"})
+    assert earlier.quarters.tolist() == [0] * 10  # of weights from before it was known
 
 
 def test_few_views_of_few_points_will_do():
