@@ -55,9 +55,9 @@ def discover_from_scans(
 
     Args:
         orientation: How far objects are turned in the views.
-        to_stand: Of a shape, the clouds it is registered to, and which of these [m] fit best: by how many quarters [n]
-            objects are to be turned until they stand as most do, and rotations [n, 3, 3] from canonical space as it
-            then stands to canonical space.
+        to_stand: Of a shape, the clouds it is registered to (scans, then their mirror images), and which of these [m]
+            fit best: by how many quarters [n] objects are to be turned until they stand as most do, and rotations
+            [n, 3, 3] from canonical space as it then stands to canonical space.
 
     Raises:
         DiscoveryError: if parts are not found (`discover_grouped`).
@@ -68,9 +68,12 @@ def discover_from_scans(
     mean_distance = float((views - views.mean(dim=1, keepdim=True)).norm(dim=-1).mean())
     quarters = torch.zeros(len(clouds), dtype=torch.long)
     if orientation.limited:
+        count, clouds = len(clouds), torch.cat([clouds, _in_the_mirror(found, clouds)])
+        found = found.of_clouds(torch.arange(count).repeat(2))
         quarters, lying = to_stand(found, clouds, best)
+        quarters[count:][quarters[:count] == 0] = 0  # what stands is as seen in scans
     best, lie = best[quarters[best] == 0], quarters.nonzero()[:, 0]
-    kept = torch.cat([best, lie, lie])
+    kept = torch.cat([best, lie])
     turns = OrientationRange().draw(len(kept) * _VIEWS, generator)
     if orientation.limited:
         _announce(0, "how objects are turned")
@@ -79,11 +82,8 @@ def discover_from_scans(
         stand = find_view_orientations(views, seen, shown.base[:, :3, :3])
         found = found.turned(stand.mean)
         turns = stand.draw(len(turns), orientation, generator).unflatten(0, (-1, _VIEWS))
-        lying = torch.cat([lying[best], lying[lie], lying[lie].mT])
-        turns = turns @ (stand.mean @ lying.mT @ stand.mean.mT)[:, None]
-    quarters = torch.cat([quarters[best], quarters[lie], -quarters[lie] % 4])
-    clouds = torch.cat([clouds[best], clouds[lie], _in_the_mirror(found.of_clouds(lie), clouds[lie])])
-    found = replace(found.of_clouds(kept), quarters=quarters)
+        turns = turns @ (stand.mean @ lying[kept].mT @ stand.mean.mT)[:, None]
+    found, clouds = replace(found.of_clouds(kept), quarters=quarters[kept]), clouds[kept]
     _announce(1, "views of the scans")
     turns = turns.reshape(len(kept), _VIEWS, 3, 3)
     simulated = simulate_views(found, clouds, turns, num_points, mean_distance, random, reshape=True)

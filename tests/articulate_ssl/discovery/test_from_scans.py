@@ -55,7 +55,7 @@ def test_views_that_teach_are_turned_as_the_views_are(monkeypatch, degrees):
 
 
 def test_what_lies_is_seen_as_it_stands_and_said_to_lie(monkeypatch):
-    """Also where it fits worst: objects that are hinged otherwise than most do."""
+    """Also where it fits worst, as objects do that are hinged otherwise than most; and in the mirror."""
     monkeypatch.setattr(reshaping, "_SPREAD", 0.0)
     data = clouds(LAPTOP, count=16, points=1024)
     truth = RegisteredShape(true_shape(LAPTOP, data), data.base, data.state, torch.zeros(16, 2, 3), torch.arange(16.0))
@@ -68,8 +68,10 @@ def test_what_lies_is_seen_as_it_stands_and_said_to_lie(monkeypatch):
     def to_stand(found, clouds, best):
         asked.append(sorted(best.tolist()))
         quarters, turn = _all_stand(found, clouds, best)
-        quarters[[3, 15]], turn = 1, turn.clone()  # one that fits well, too
-        turn[[3, 15]] = lying
+        turn = turn.clone()
+        quarters[[3, 15]], turn[[3, 15]] = 1, lying  # one that fits well, too
+        quarters[[19, 31]], turn[[19, 31]] = 3, lying.mT  # the same in the mirror
+        quarters[20] = 2  # in the mirror what stands as it is
         return quarters, turn
 
     monkeypatch.setattr(from_scans, "discover_grouped", lambda *_: truth)
