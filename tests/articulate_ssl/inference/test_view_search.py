@@ -231,3 +231,25 @@ def test_what_is_hinged_otherwise_is_sought_among_its_own_views_and_believed_whe
     torch.testing.assert_close(margin[:2], 1 - error[:2] / before[:2])
     assert (margin[:2] > 0).all() and margin[2] == 2  # nothing that is turned another way was tried of it
     assert (said.share[:2] != 0.5).any()
+
+
+@torch.no_grad()
+def test_what_is_hinged_otherwise_and_fits_worse_is_a_rival_if_none_is_nearer(learnt, estimator, monkeypatch):
+    data = _views(3, seed=7)
+    points = data.points[:, :256]
+    views = estimator.view_search
+    views.load_state_dict(learnt.state_dict())
+    views.quarters = torch.arange(300) % 2
+    views.base = torch.where(views.quarters.bool()[:, None, None], views.base @ se3(OVER, torch.zeros(3)), views.base)
+    monkeypatch.setattr(UprightCamera, "stood", _Camera().stood)
+    estimator.hinge_sides.camera.learnt.fill_(True)
+    one = estimator.articulated.category_at(data.base[:, None], data.state[:, None])
+    one = estimator.final.in_proportion(one, points, data.points)
+    margin = torch.tensor([1.0, 1.0, 1e-4])
+    found, rival, said, _ = estimator.other_hinges.sought(one, one, margin, learnt.search(points).votes, points, None)
+    assert _degrees(found.base[:, 0, :3, :3], data.base[:, :3, :3]).max() < 20
+    assert _degrees(rival.base[:2, 0, :3, :3], data.base[:2, :3, :3]).min() > 90
+    torch.testing.assert_close(rival.base[2], one.base[2])
+    error, other = (estimator.final.distance(this, points) for this in (found, rival))
+    torch.testing.assert_close(said[:2], 1 - error[:2] / other[:2])
+    assert (said[:2] > 0.02).all() and said[2] == 1e-4
