@@ -91,7 +91,7 @@ class ViewSearch(nn.Module):
 
     def forget(self) -> None:
         """As before there were any."""
-        self.views, self.parts = self.views[:0], None
+        self.views, self.quarters, self.parts = self.views[:0], self.quarters[:0], None
 
     def learn(
         self,

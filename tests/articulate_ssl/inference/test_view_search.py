@@ -121,6 +121,10 @@ def test_of_what_lies_as_many_views_are_kept_as_of_what_stands(monkeypatch, lyin
     assert torch.equal(quarters[rows], search.quarters)
     if kept > 3:  # spread evenly
         assert quarters[: rows[-kept]].count_nonzero() == 0 and quarters[rows[-1] + 1 :].count_nonzero() == 0
+    forgotten = ViewSearch(2)
+    forgotten.load_state_dict(search.state_dict())
+    forgotten.forget()
+    assert not forgotten.quarters.any()
     again, earlier = ViewSearch(2), ViewSearch(2)
     again.load_state_dict(search.state_dict())
     assert torch.equal(again.quarters, search.quarters)
