@@ -34,9 +34,9 @@ _DOUBT = 0.06  # share of the lessons about doors that may be wrong. No other wa
 _FIRST, _KNOWN = 64, 0.9
 _VIEWS = 256  # of an upright camera, from which nothing is learnt but a direction and a share. Chosen.
 # Shares of the clouds that the network was not taught by. Chosen: fewer that are turned are not worth a network; more
-# would mean that most are not right; and one that cannot tell sides apart is undecided of many.
+# would mean that most are not right; and one that cannot tell sides apart is undecided of many, as a camera is mistaken
+# about many simulated views.
 _LEAST_TURNED, _MOST_TURNED, _MOST_UNDECIDED = 0.02, 0.4, 0.15
-# Of simulated views it is known how they lie; the last is the share of them that a camera mistakes.
 _RARE = 1e-3  # least share of a side
 _SHARES = 50  # rounds of expectation and maximisation
 
