@@ -38,6 +38,7 @@ MULTI_STATE = (
     ("desk_lamp", "complete"),
     ("washing_machine", "complete"),
     ("laptop", "depth"),
+    ("oven", "depth"),
     ("safe", "depth"),
     ("washing_machine", "depth"),
     ("desk_lamp", "depth"),
