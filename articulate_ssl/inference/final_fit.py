@@ -7,8 +7,10 @@ other door would be open farther than any. Joint limits are those of what is pre
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
+import roma
 import torch
 from torch import Tensor
 
@@ -29,6 +31,7 @@ from articulate_ssl.ops.chamfer import chamfer
 # How much larger the error of what is within the joints' limits may be. Rivals of ovens that were explained by a door
 # beyond them had up to 1.23 times the error (docs/experiments.md, step 144). Chosen.
 ABOUT_AS_WELL = 1.3
+_TURNED = 1.0  # degrees by which faces turn a part once more, from which on proportions are fitted once more
 
 
 class FinalFit:
@@ -88,14 +91,18 @@ class FinalFit:
             return fit_proportions(one, category, points, descent)
         one, known = frames.settled(one, dense)
         descent = descent._replace(faces=frames.axes, known=known)
-        if not self.common_shape.learnt:
-            return fit_proportions(one, category, points, descent)
+        if self.common_shape.learnt:
+            category = self.common_shape.shape(category.joints)
+            one = replace(one, structure=replace(one.structure, pivot=self.common_shape.pivots(len(points))))
+        fitted = fit_proportions(one, category, points, descent)
         # Registered with another shape, a part may be so far off that faces of others are taken for its own.
-        category = self.common_shape.shape(category.joints)
-        one = replace(one, structure=replace(one.structure, pivot=self.common_shape.pivots(len(points))))
-        settled, known = frames.settled(fit_proportions(one, category, points, descent), dense)
-        one = one.at(settled.base, settled.state)
-        return fit_proportions(one, category, points, descent._replace(known=known))
+        settled, known = frames.settled(fitted, dense)
+        rows = _elsewhere(settled, fitted).nonzero()[:, 0]
+        if not len(rows):
+            return fitted
+        again, known = one.at(settled.base, settled.state).rows(rows), (known[0][rows], known[1][rows])
+        again = fit_proportions(again, category, points[rows], descent._replace(known=known))
+        return fitted.with_rows(rows, again)
 
     def within_limits(
         self,
@@ -160,3 +167,9 @@ class FinalFit:
 
     def _within(self, one: Hypotheses) -> Tensor:  # [B] bool
         return self.registration.states.contains(one.state[:, 0])
+
+
+def _elsewhere(one: Hypotheses, other: Hypotheses) -> Tensor:  # H = 1 each, [B] bool
+    """Whether a part of theirs is turned differently."""
+    turn = roma.rotmat_geodesic_distance(one.object_pose()[..., :3, :3], other.object_pose()[..., :3, :3])
+    return (turn[:, 0] > math.radians(_TURNED)).any(dim=-1)

@@ -1,5 +1,6 @@
 """What is decided for gives way where its joints are as none was seen, and only there."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -17,6 +18,7 @@ from articulate_ssl.inference.hypothesis_registration import HypothesisRegistrat
 from articulate_ssl.inference.object_frame import ObjectFrame
 from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.inference.part_frames import PartFrames
+from articulate_ssl.inference.proportions import Descent, fit_proportions
 from articulate_ssl.inference.state_range import StateRange
 from articulate_ssl.inference.view_search import ViewSearch
 from articulate_ssl.network.hypotheses import Hypotheses
@@ -100,6 +102,32 @@ def test_nothing_is_tried_again_in_vain(final, data, monkeypatch, known):
     shown, rival, margin = final.within_limits(start, start, torch.ones(4), data.points, None)
     assert torch.equal(shown.state, final.in_proportion(start, data.points, None).state)
     assert rival is start and (margin == 1).all()
+
+
+@pytest.mark.parametrize(("degrees", "again"), [(5.0, True), (0.5, False)])
+def test_faces_are_asked_once_more_of_what_has_its_proportions(final, data, monkeypatch, degrees, again):
+    """Of the third cloud they turn the door then; the others are as they would be alone."""
+    start, said = _at(final, data, data.state), []
+    known = torch.ones(4, dtype=torch.bool), torch.ones(4, 1, dtype=torch.bool)
+
+    def settled(one, dense):
+        assert dense is data.points
+        state = one.state.clone()
+        if len(said):
+            state[2] += math.radians(degrees)
+        said.append(state)
+        return one.at(one.base, state), known
+
+    frames = SimpleNamespace(learnt=True, axes=torch.eye(3).repeat(2, 1, 1), settled=settled)
+    monkeypatch.setattr(final, "part_frames", frames)
+    points = data.points[:, :200]
+    shown = final.in_proportion(start, points, data.points)
+    assert len(said) == 2
+    torch.testing.assert_close(shown.state, said[int(again)])
+    category = final.articulated.category.articulated_shape(final.articulated.joint_type)
+    once = fit_proportions(start, category, points, Descent(6, faces=frames.axes, known=known))
+    changed = (shown.object_shape() != once.object_shape()).flatten(1).any(dim=1)
+    assert changed.tolist() == [False, False, again, False]
 
 
 def test_what_slides_or_takes_no_proportions_stays_as_it_is(final, data):
