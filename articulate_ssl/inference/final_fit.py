@@ -72,7 +72,10 @@ class FinalFit:
         points: Tensor,  # [B, N, 3]
         dense: Tensor | None,  # [B, P, 3]
     ) -> Hypotheses:  # H = 1
-        """Explanations in the proportions of clouds (`fit_proportions`), turned as faces say."""
+        """Explanations in the proportions of clouds (`fit_proportions`), turned as faces say.
+
+        Which face is of which part, explanations say, so faces are asked before, and once more of what was fitted.
+        """
         if not self.fits:
             return one
         category = self.articulated.category.articulated_shape(self.articulated.joint_type)
