@@ -57,7 +57,9 @@ class Programs:
 
 
 @pytest.fixture
-def plan(tmp_path) -> Rebuild:
+def plan(tmp_path, monkeypatch) -> Rebuild:
+    """Of one stage a kind, whichever sets scans teach."""
+    monkeypatch.setattr(module, "MULTI_STATE", ())
     return Rebuild("oven", "depth", tmp_path / "build", tmp_path / "weights")
 
 
