@@ -32,7 +32,7 @@ DEPTH_OPTIONS = ("--train-instances", "120", "--test-instances", "60", "--states
 # laptops by 800 clouds of 300 objects, for 97 % by 600 clouds of as many objects (docs/experiments.md, step 64).
 COMPLETE_OPTIONS = ("--train-instances", "1000", "--test-instances", "100", "--states", "3", "--rotations", "1")
 # Where clouds that are known to show one object find parts, or joints, better than single ones (docs/experiments.md,
-# steps 71, 72, 232).
+# steps 71, 72, 232, 248).
 MULTI_STATE = (
     ("drawer", "complete"),
     ("desk_lamp", "complete"),
