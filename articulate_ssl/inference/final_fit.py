@@ -7,7 +7,6 @@ other door would be open farther than any. Joint limits are those of what is pre
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import roma
@@ -21,7 +20,7 @@ from articulate_ssl.inference.candidates import Candidates
 from articulate_ssl.inference.common_shape import CommonShape
 from articulate_ssl.inference.hypothesis_registration import HypothesisRegistration
 from articulate_ssl.inference.object_frame import ObjectFrame
-from articulate_ssl.inference.part_frames import PartFrames
+from articulate_ssl.inference.part_frames import FARTHEST, PartFrames
 from articulate_ssl.inference.proportions import Descent, fit_proportions
 from articulate_ssl.inference.view_search import ViewSearch
 from articulate_ssl.network.articulated_network import ArticulatedNetwork
@@ -74,7 +73,8 @@ class FinalFit:
     ) -> Hypotheses:  # H = 1
         """Explanations in the proportions of clouds (`fit_proportions`), turned as faces say.
 
-        Which face is of which part, explanations say, so faces are asked before, and once more of what was fitted.
+        Which face is of which part, explanations say, so faces are asked before, and once more of what was fitted. Then
+        joints may turn far, if the cloud is explained better.
         """
         if not self.fits:
             return one
@@ -99,13 +99,16 @@ class FinalFit:
             one = replace(one, structure=replace(one.structure, pivot=self.common_shape.pivots(len(points))))
         fitted = fit_proportions(one, category, points, descent)
         # Registered with another shape, a part may be so far off that faces of others are taken for its own.
-        settled, known = frames.settled(fitted, dense)
-        rows = _elsewhere(settled, fitted).nonzero()[:, 0]
+        settled, known = frames.settled(fitted, dense, afar=True)
+        turn = _turn(settled, fitted)
+        rows = (turn > _TURNED).nonzero()[:, 0]
         if not len(rows):
             return fitted
         again, known = one.at(settled.base, settled.state).rows(rows), (known[0][rows], known[1][rows])
         again = fit_proportions(again, category, points[rows], descent._replace(known=known))
-        return fitted.with_rows(rows, again)
+        closer = self.distance(again, points[rows]) < self.distance(fitted.rows(rows), points[rows])
+        kept = (closer | (turn[rows] < FARTHEST)).nonzero()[:, 0]
+        return fitted.with_rows(rows[kept], again.rows(kept))
 
     def within_limits(
         self,
@@ -172,7 +175,7 @@ class FinalFit:
         return self.registration.states.contains(one.state[:, 0])
 
 
-def _elsewhere(one: Hypotheses, other: Hypotheses) -> Tensor:  # H = 1 each, [B] bool
-    """Whether a part of theirs is turned differently."""
+def _turn(one: Hypotheses, other: Hypotheses) -> Tensor:  # H = 1 each, [B] degrees
+    """By how much the part that is turned most differently is."""
     turn = roma.rotmat_geodesic_distance(one.object_pose()[..., :3, :3], other.object_pose()[..., :3, :3])
-    return (turn[:, 0] > math.radians(_TURNED)).any(dim=-1)
+    return turn[:, 0].amax(dim=-1).rad2deg()

@@ -38,7 +38,11 @@ _CURVED, _FLAT = 0.3, 0.01
 _REACH = (20.0, 6.0)  # degrees: a normal farther from every axis does not count, in the first round and in the last
 _ROUNDS = 8
 _PRIOR = 0.02  # of what normals weigh, weighs how the part was turned: that decides what they leave open
-_FARTHEST = 20.0  # degrees that faces may turn a part by
+FARTHEST = 20.0  # degrees that faces may turn a part by
+# A joint may be farther off: where parts are shorter than the category's, as doors beside a panel, registration turns
+# them until their ends are where they should be. So faces are also asked from here, in degrees; those that are halfway
+# to the next quarter turn are as near to that.
+_STARTS, _HALFWAY = (0.0, -25.0, 25.0), 45.0
 _FEWEST = 20  # faces that say how it is turned
 _LESSONS = 4  # rounds of squaring parts to their faces, and of seeing where these lie
 _TOGETHER, _SHARE = 12.0, 0.8  # a part has faces if in so many clouds they are so near, in degrees, to where most are
@@ -135,13 +139,18 @@ class PartFrames(LateBuffers):
         self,
         one: Hypotheses,  # H = 1
         dense: Tensor,  # [B, P, 3]
+        afar: bool = False,
     ) -> tuple[Hypotheses, tuple[Tensor, Tensor]]:  # H = 1, ([B], [B, J])
-        """Explanations turned as the faces of clouds say, and whether they do: of the whole, and of every joint."""
+        """Explanations turned as the faces of clouds say, and whether they do: of the whole, and of every joint.
+
+        Faces turn the whole by at most 20 degrees, and joints likewise; `afar` joints by up to 45, if nothing nearer is
+        square to them: whoever asks for that has to see whether it explains the cloud.
+        """
         axis = torch.where(self.measured[:, None], self.direction, one.axis)
         one = replace(one, structure=replace(one.structure, axis=axis))
         windows = [WINDOWS[int(wide)] for wide in self.wide]
         one, turned = self._root_squared(one, faces_of(one, dense, windows).of(one.chain.root))
-        one, moved = self._joints_squared(one, faces_of(one, dense, windows))
+        one, moved = self._joints_squared(one, faces_of(one, dense, windows), afar)
         return one, (turned, moved)
 
     def _lie(
@@ -175,7 +184,7 @@ class PartFrames(LateBuffers):
         """Explanations turned about the middle of their root until it is square to its faces, and which were."""
         root, old = one.chain.root, one.base[:, 0, :3, :3]
         new = square_to(old @ self.axes[root], faces)[0] @ self.axes[root].mT
-        turned = faces.enough & (roma.rotmat_geodesic_distance(new, old) < math.radians(_FARTHEST))
+        turned = faces.enough & (roma.rotmat_geodesic_distance(new, old) < math.radians(FARTHEST))
         new = torch.where(turned[:, None, None], new, old)
         middle = one.object_shape()[:, root].mean(dim=1, keepdim=True)
         place = one.base[:, 0, :3, 3] + (middle @ (old - new).mT).squeeze(1)
@@ -185,6 +194,7 @@ class PartFrames(LateBuffers):
         self,
         one: Hypotheses,  # H = 1
         faces: Faces,
+        afar: bool,
     ) -> tuple[Hypotheses, Tensor]:  # H = 1, [B, J]
         """Explanations with joints in the states in which parts are square to their faces, and which were."""
         moved = torch.zeros_like(one.state[:, 0], dtype=torch.bool)
@@ -192,8 +202,10 @@ class PartFrames(LateBuffers):
             if not self.flat[part]:
                 continue
             pose, own = one.object_pose()[:, 0, part, :3, :3], faces.of(part)
-            angle = _squared_about((pose @ one.axis[:, 0, joint, :, None]).squeeze(-1), pose @ self.axes[part], own)
-            moved[:, joint] = own.enough & (angle.abs() < math.radians(_FARTHEST))
+            axis = (pose @ one.axis[:, 0, joint, :, None]).squeeze(-1)
+            look = _squared_from_afar if afar else _squared_about
+            angle = look(axis, pose @ self.axes[part], own)
+            moved[:, joint] = own.enough & (angle.abs() < math.radians(_HALFWAY if afar else FARTHEST))
             state = one.state.clone()
             state[:, 0, joint] += torch.where(moved[:, joint], angle, 0)
             one = one.at(one.base, state)
@@ -268,9 +280,40 @@ def square_to(
     for reach in torch.linspace(*_REACH, _ROUNDS).deg2rad():
         to_axis = _nearest_axis(frame, faces.normal, reach)
         frame = roma.special_procrustes(torch.einsum("bmi,bmj->bij", weight * faces.normal, to_axis) + prior * start)
+    return frame, _off_square(frame, faces)
+
+
+def _off_square(frame: Tensor, faces: Faces) -> Tensor:
+    """Mean angles [B] (degrees, capped) of normals to the nearest axes of frames [B, 3, 3]."""
     cosine = torch.einsum("bij,bmi->bmj", frame, faces.normal).abs().amax(dim=-1).clamp(max=1)
     angle = cosine.acos().rad2deg().clamp(max=_MOST)
-    return frame, (faces.weight * angle).sum(dim=1) / faces.weight.sum(dim=1).clamp(min=1e-6)
+    return (faces.weight * angle).sum(dim=1) / faces.weight.sum(dim=1).clamp(min=1e-6)
+
+
+def _squared_from_afar(
+    axis: Tensor,  # [B, 3] unit
+    frame: Tensor,  # [B, 3, 3] columns
+    faces: Faces,
+) -> Tensor:  # [B] radians
+    """As `_squared_about`, from farther away, too: the least turn after which normals are square to frames.
+
+    If there is none, by how much normals within reach turn them. Normals along the axis are square however they turn.
+    """
+    across = (faces.normal @ axis[..., None]).squeeze(-1).abs() < math.sqrt(0.5)
+    telling = faces._replace(weight=faces.weight * across)
+    found = []
+    for start in torch.tensor(_STARTS).deg2rad().to(axis):
+        angle = start + _squared_about(axis, _turned(frame, axis, start.expand(len(axis))), faces)
+        square = telling.enough & (_off_square(_turned(frame, axis, angle), telling) < _SQUARE)
+        found.append(torch.stack([angle, torch.where(square, angle.abs(), torch.inf)]))
+    angle, turn = torch.stack(found, dim=1)
+    least = turn.argmin(dim=0, keepdim=True)  # the first if none is square
+    return angle.gather(0, least)[0]
+
+
+def _turned(frame: Tensor, axis: Tensor, angle: Tensor) -> Tensor:
+    """Frames [B, 3, 3] about axes [B, 3] by angles [B]."""
+    return roma.rotvec_to_rotmat(axis * angle[:, None]) @ frame
 
 
 def _squared_about(
@@ -282,7 +325,7 @@ def _squared_about(
     total = torch.zeros_like(axis[:, 0])
     along = (faces.normal @ axis[..., None]).squeeze(-1)
     for reach in torch.linspace(*_REACH, _ROUNDS).deg2rad():
-        turned = roma.rotvec_to_rotmat(axis * total[:, None]) @ frame
+        turned = _turned(frame, axis, total)
         target = torch.einsum("bij,bmj->bmi", turned, _nearest_axis(turned, faces.normal, reach))
         sine = (torch.linalg.cross(target, faces.normal) @ axis[..., None]).squeeze(-1)
         cosine = (target * faces.normal).sum(dim=-1) - along * (target @ axis[..., None]).squeeze(-1)

@@ -68,7 +68,7 @@ def test_it_takes_proportions_where_faces_are_known(monkeypatch):
         seen.append((category.points.shape[0], one.pivot[0, 0].tolist(), float(one.state[0, 0, 0])))
         return one
 
-    def settled(one, dense):
+    def settled(one, dense, afar=False):
         looks.append(len(seen))
         known = torch.ones(len(dense), dtype=torch.bool), torch.ones(len(dense), 1, dtype=torch.bool)
         return one.at(one.base, torch.full_like(one.state, 0.1 * len(looks))), known

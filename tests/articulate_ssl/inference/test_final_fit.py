@@ -110,8 +110,9 @@ def test_faces_are_asked_once_more_of_what_has_its_proportions(final, data, monk
     start, said = _at(final, data, data.state), []
     known = torch.ones(4, dtype=torch.bool), torch.ones(4, 1, dtype=torch.bool)
 
-    def settled(one, dense):
+    def settled(one, dense, afar=False):
         assert dense is data.points
+        assert afar == bool(said)
         state = one.state.clone()
         if len(said):
             state[2] += math.radians(degrees)
@@ -128,6 +129,23 @@ def test_faces_are_asked_once_more_of_what_has_its_proportions(final, data, monk
     once = fit_proportions(start, category, points, Descent(6, faces=frames.axes, known=known))
     changed = (shown.object_shape() != once.object_shape()).flatten(1).any(dim=1)
     assert changed.tolist() == [False, False, again, False]
+
+
+@pytest.mark.parametrize(("first", "then", "kept"), [(40, -40, True), (0, 40, False), (0, 8, True)])
+def test_faces_turn_a_door_far_only_if_that_explains_the_cloud_better(final, data, monkeypatch, first, then, kept):
+    """Where the door was turned too far before, and where faces are of something else; a little as they say."""
+    start, asked = _at(final, data, data.state), []
+    known = torch.ones(4, dtype=torch.bool), torch.ones(4, 1, dtype=torch.bool)
+
+    def settled(one, _dense, afar=False):
+        asked.append(afar)
+        return one.at(one.base, one.state + math.radians(then if afar else first)), known
+
+    frames = SimpleNamespace(learnt=True, axes=torch.eye(3).repeat(2, 1, 1), settled=settled)
+    monkeypatch.setattr(final, "part_frames", frames)
+    shown = final.in_proportion(start, data.points[:, :200], data.points)
+    assert asked == [False, True]
+    torch.testing.assert_close(shown.state, start.state + math.radians(first + then * kept))
 
 
 def test_what_slides_or_takes_no_proportions_stays_as_it_is(final, data):

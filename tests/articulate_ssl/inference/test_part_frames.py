@@ -136,12 +136,58 @@ def test_what_is_too_far_from_its_faces_stays(oven, monkeypatch):
     """Base and states, where faces would turn them by more than they may."""
     frames, data = oven[0], _data(count=6, seed=3)
     one = _explained(OVEN, data)
-    monkeypatch.setattr(part_frames, "_FARTHEST", 1e-3)
+    monkeypatch.setattr(part_frames, "FARTHEST", 1e-3)
     after, (turned, moved) = frames.settled(one, data.points)
     assert not turned.any()
     assert not moved.any()
     torch.testing.assert_close(after.base, one.base)
     torch.testing.assert_close(after.state, one.state)
+
+
+@pytest.mark.parametrize("off", [-40, -25, 5, 40])
+def test_doors_that_are_farther_off_than_normals_reach_are_found(off):
+    """As those beside a panel: registration turns them until their ends are where they should be."""
+    turn = roma.random_rotmat(6)
+    axis, frame = turn[:, :, 1], turn @ _about_y(torch.full((6,), float(-off)))
+    noise = 0.02 * torch.randn(6, 200, 3, generator=torch.Generator().manual_seed(0))
+    normal = torch.nn.functional.normalize(turn[:, None, :, 2] + noise, dim=-1)
+    faces = Faces(normal, torch.ones(6, 200))
+    angle = part_frames._squared_from_afar(axis, frame, faces)
+    torch.testing.assert_close(angle.rad2deg(), torch.full((6,), float(off)), atol=0.5, rtol=0)
+    near = part_frames._squared_about(axis, frame, faces)
+    assert ((near - angle).rad2deg().abs() < 0.5).all() == (abs(off) < 20)
+
+
+def test_faces_that_are_square_however_a_part_turns_do_not_keep_it_where_it_is():
+    """The sides of a door are, and may be most of what is seen of it."""
+    normal = torch.tensor([[0.0, 1.0, 0.0]] * 150 + [[0.0, 0.0, 1.0]] * 50)[None]
+    faces, axis = Faces(normal, torch.ones(1, 200)), torch.tensor([[0.0, 1.0, 0.0]])
+    angle = part_frames._squared_from_afar(axis, _about_y(torch.tensor([-35.0])), faces)
+    torch.testing.assert_close(angle.rad2deg(), torch.tensor([35.0]), atol=0.1, rtol=0)
+
+
+def test_normals_that_point_anywhere_turn_nothing_far():
+    """As those of a handle: within reach they pull as ever."""
+    generator, frames = torch.Generator().manual_seed(0), torch.eye(3).expand(64, 3, 3)
+    normal = torch.nn.functional.normalize(torch.randn(64, 200, 3, generator=generator), dim=-1)
+    faces, axis = Faces(normal, torch.ones(64, 200)), torch.tensor([0.0, 1.0, 0.0]).expand(64, 3)
+    angle = part_frames._squared_from_afar(axis, frames, faces)
+    torch.testing.assert_close(angle, part_frames._squared_about(axis, frames, faces))
+
+
+def _about_y(degrees: torch.Tensor) -> torch.Tensor:
+    return roma.rotvec_to_rotmat(torch.tensor([0.0, 1.0, 0.0]) * degrees.deg2rad()[:, None])
+
+
+@pytest.mark.parametrize("afar", [False, True])
+def test_joints_turn_far_if_that_is_asked_for(oven, monkeypatch, afar):
+    frames, data = oven[0], _data(count=6, seed=3)
+    one = true_hypotheses(OVEN, data)
+    asked = "_squared_from_afar" if afar else "_squared_about"
+    monkeypatch.setattr(part_frames, asked, lambda axis, *_: torch.full_like(axis[:, 0], math.radians(30)))
+    after, (_, moved) = frames.settled(one, data.points, afar)
+    assert (moved == afar).all()
+    torch.testing.assert_close(after.state, one.state + math.radians(30) * afar)
 
 
 def test_plates_say_how_they_are_turned_and_not_about_what():
@@ -296,7 +342,7 @@ def test_an_estimate_with_dense_clouds_is_settled(oven, monkeypatch):
     module.part_frames.load_state_dict(oven[0].state_dict())
     seen = []
 
-    def settled(one, dense):
+    def settled(one, dense, afar=False):
         seen.append(dense.shape[1])
         return one, (torch.ones(len(dense), dtype=torch.bool), torch.zeros(len(dense), 1, dtype=torch.bool))
 
