@@ -38,7 +38,7 @@ _CURVED, _FLAT = 0.3, 0.01
 _REACH = (20.0, 6.0)  # degrees: a normal farther from every axis does not count, in the first round and in the last
 _ROUNDS = 8
 _PRIOR = 0.02  # of what normals weigh, weighs how the part was turned: that decides what they leave open
-FARTHEST = 20.0  # degrees that faces may turn a part by
+FARTHEST = 20.0  # degrees that faces may turn a part by on their word alone
 # A joint may be farther off: where parts are shorter than the category's, as doors beside a panel, registration turns
 # them until their ends are where they should be. So faces are also asked from here, in degrees; those that are halfway
 # to the next quarter turn are as near to that.
