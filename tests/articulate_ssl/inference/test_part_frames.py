@@ -147,6 +147,7 @@ def test_what_is_too_far_from_its_faces_stays(oven, monkeypatch):
 @pytest.mark.parametrize("off", [-40, -25, 5, 40])
 def test_doors_that_are_farther_off_than_normals_reach_are_found(off):
     """As those beside a panel: registration turns them until their ends are where they should be."""
+    torch.manual_seed(0)
     turn = roma.random_rotmat(6)
     axis, frame = turn[:, :, 1], turn @ _about_y(torch.full((6,), float(-off)))
     noise = 0.02 * torch.randn(6, 200, 3, generator=torch.Generator().manual_seed(0))
