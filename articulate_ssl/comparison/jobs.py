@@ -19,27 +19,21 @@ from articulate_ssl.baselines import METHODS
 from articulate_ssl.comparison.rows import MULTI_STATE, needs_occupancy, recipe_of
 from articulate_ssl.metrics.report import JSON_NAME
 from articulate_ssl.pretrained.pack import PROFILES, VIEW_OF_DATA, fit_command, generate_arguments, newest_metrics
-from articulate_ssl.pretrained.rebuild import (
-    COMPLETE_OPTIONS,
-    DEPTH_OPTIONS,
-    MULTI_STATE_OPTIONS,
-    SCANS_OPTIONS,
-    resumed,
-)
+from articulate_ssl.pretrained.rebuild import COMPLETE_OPTIONS, DEPTH_OPTIONS, SCANS_OPTIONS, resumed
 from articulate_ssl.pretrained.stages import Stage, Workplace
 from articulate_ssl.training.checkpoint import load_module
 from datamodules.manifest import MANIFEST_NAME, Manifest, ManifestError, set_folder
 from datamodules.occupancy import FOLDER, INDEX_NAME
 
 DATA_SEED = 21  # no other: shipped weights and their check are of 11 and 12, README's numbers of 1 to 4
-# Of the objects that multi-state trainings know in ten states each: others, so that none of them is tested on.
+# Of the objects that multi-state trainings know in ten states each, beside the table's clouds: others, so that none of
+# them is tested on.
 SCANS_SEED = 22
 _SCANS = "scans"  # folder of their set, and its stage
 OCCUPANCY_SAMPLES = 2048  # of each training cloud
 # Configuration files of recipes that need their own, behind the category's and the profile.
 RECIPE_CONFIGS = {"paper": (Path("configs/profiles/paper_recipe.yaml"),)}
 _SOURCE = "procedural"  # of the set that trains
-_NO_TEST = ("--test-instances", "1")  # of scans, of which nothing is tested; the last option of a name counts
 SAMPLES = 300  # test clouds; chosen: Oracle ICP takes two seconds for each
 
 
@@ -141,8 +135,7 @@ def make_data(setting: Setting, learners: tuple[str, ...], say: Callable[[str], 
             f"SOURCE={setting.test_source} ROOT=<folder of the objects> OUT={setting.test_root or setting.root}"
         )
     if MULTI_STATE in learners and not (setting.scans / MANIFEST_NAME).is_file():
-        options = (*(MULTI_STATE_OPTIONS if setting.view == "complete" else SCANS_OPTIONS), *_NO_TEST)
-        words = ("--category", setting.category, "--view", "complete", "--seed", str(SCANS_SEED), *options)
+        words = ("--category", setting.category, "--view", "complete", "--seed", str(SCANS_SEED), *SCANS_OPTIONS)
         _generate(setting, _SCANS, words, setting.scans_root, say)
     folder = setting.training_set
     occupancy = needs_occupancy(learners)
@@ -251,19 +244,15 @@ class Job:
     def _recipe_stages(self) -> tuple[Stage, ...]:
         setting, told = self.setting, self.learner == MULTI_STATE
         _, fit, *learn = fit_command(setting.category, VIEW_OF_DATA[setting.view], self.seed, told)
-        if "--data.scans" in learn:
-            learn[learn.index("--data.scans") + 1] = str(setting.scans)
+        learn += ["--data.scans", str(setting.scans)] if told else []
         configs = (*RECIPE_CONFIGS.get(self.learner, ()), *setting.configs)
         learn += [word for file in configs for word in ("-c", str(file))]
-        # Of complete clouds, scans take the place of the table's training clouds; of views, they are beside them.
-        scans_alone = told and setting.view == "complete"
-        root = setting.scans_root if scans_alone else setting.root
-        learn += ["--model.recipe", recipe_of(self.learner), "--data.root", str(root), "--data.seed", str(self.seed)]
+        learn += ["--model.recipe", recipe_of(self.learner)]
+        learn += ["--data.root", str(setting.root), "--data.seed", str(self.seed)]
         learn += ["--data.max_test_samples", str(setting.samples), "--trainer.enable_progress_bar", "false"]
         learn += ["--trainer.default_root_dir", str(self._run)]
         ours = (sys.executable, "-m", "articulate_ssl.cli")
         columns = ("--model.inference.columns", "true")
-        columns += ("--data.root", str(setting.root)) if scans_alone else ()
         stages = (Stage("fit", (*ours, fit, *learn)), Stage("test", (*ours, "test", *learn, *columns)))
         if setting.test_source is None:
             return stages

@@ -115,7 +115,7 @@ def _row_result(row: Row, seeds: tuple[int, ...], reports: list[dict[str, Any]],
     if not reports:
         return RowResult(row, printed=printed)
     if any(report.get("setting") == MULTI_STATE_SETTING for report in reports):  # configurations can say so, too
-        scans = (SCANS,) if row.learner == MULTI_STATE and setting.view == "partial" else ()
+        scans = (SCANS,) if row.learner == MULTI_STATE else ()
         row = replace(row, given=(*row.given, OBJECTS, *scans))
     each = [{(quantity, of): value for quantity, of, value in statistics_of(report)} for report in reports]
     values = {

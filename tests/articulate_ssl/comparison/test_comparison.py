@@ -153,11 +153,8 @@ def test_the_multi_state_setting_learns_from_other_objects_and_is_tested_on_the_
     assert _value(fit.command, "--model.recipe") == "staged"
     profile = {"complete": "multi_state", "partial": "depth_from_scans"}[view]
     assert f"configs/profiles/{profile}.yaml" in fit.command
-    if view == "complete":
-        assert _value(fit.command, "--data.root") == str(setting.scans_root)
-    else:
-        assert _value(fit.command, "--data.scans") == _value(test.command, "--data.scans") == str(setting.scans)
-        assert _value(fit.command, "--data.root") == str(setting.root)
+    assert _value(fit.command, "--data.scans") == _value(test.command, "--data.scans") == str(setting.scans)
+    assert _value(fit.command, "--data.root") == str(setting.root)
 
     make_data(setting, ("staged",), print)
     assert len(programs.commands) == 1
