@@ -7,7 +7,8 @@ faces, the root is turned until it is square to them (a Manhattan frame, as of t
 `discovery.manhattan_frame`), and the joints of the others go to the states in which they are.
 
 Which parts have faces, and how these lie in canonical space, predictions of training clouds say, all together; and as
-two parts with faces are turned against each other about the joint between them, they say about which direction that is.
+two parts with faces are turned against each other about the joint between them, they say about which direction that is:
+of a box and what turns on it, by how its faces move; of two plates, whose hinge lies in both, by what all are square to.
 No label is read.
 """
 
@@ -51,6 +52,9 @@ _SQUARE, _MOST = 5.0, 10.0  # degrees: mean angle of normals to axes in the medi
 # have .16 and more, plates .01 and less.
 _BOX = 0.05
 _PARALLEL = 5.0  # degrees: a joint that is so near to an axis of the box that it is on is parallel to that
+# Degrees: two plates say about which direction they turn if the normals of most clouds are so nearly square to it (of
+# laptops .1), and are turned against each other by so much: of parallel ones any direction in them is square to both.
+_SQUARE_TO_JOINT, _TURNED = 1.0, 15.0
 
 
 class PartFrames(LateBuffers):
@@ -110,9 +114,13 @@ class PartFrames(LateBuffers):
         self.measured.fill_(False)
         for joint, (parent, child) in enumerate(zip(chain.parent, chain.child, strict=True)):
             body, part = faces.of(parent), faces.of(child)
-            if not self.flat[parent] or body.along(found[parent]).mean(dim=0).median() < _BOX:
+            if not self.flat[parent]:
                 continue
             direction = functional.normalize(one.axis[:, 0, joint].mean(dim=0), dim=0)
+            if body.along(found[parent]).mean(dim=0).median() < _BOX:
+                if self.flat[child]:
+                    self._measure_plates(joint, (parent, body, found[parent]), (part, found[child]), direction)
+                continue
             if self.flat[child]:
                 seen = self.axes[parent] @ found[parent].mT @ found[child]
                 known = body.enough & part.enough
@@ -123,6 +131,27 @@ class PartFrames(LateBuffers):
                 direction = self.axes[parent][:, nearest] * cosine[nearest].sign()
             self.direction[joint], self.measured[joint] = direction, True
         return torch.stack(quality)
+
+    def _measure_plates(
+        self,
+        joint: int,
+        body: tuple[int, Faces, Tensor],  # the plate that it is on, its faces, and its axes in camera space [n, 3, 3]
+        part: tuple[Faces, Tensor],  # the same of the plate that it turns
+        believed: Tensor,  # [3] unit
+    ) -> None:
+        """Measure the direction of a joint between plates: that which the normals of both are square to."""
+        (parent, faces, frame), (own, turning) = body, part
+        known = faces.enough & own.enough
+        if not known.any():
+            return
+        fixed, side = (int(some.along(at)[known].mean(dim=0).argmax()) for some, at in ((faces, frame), part))
+        moving = (self.axes[parent] @ frame.mT @ turning)[known][:, :, side]
+        fixed = self.axes[parent][:, fixed]
+        direction, off = _square_to_all(fixed, moving, believed)
+        turned = (moving @ fixed).abs().clamp(max=1).acos().rad2deg().median()
+        near = believed @ direction > math.cos(math.radians(FARTHEST))
+        if near and off < _SQUARE_TO_JOINT and turned > _TURNED:
+            self.direction[joint], self.measured[joint] = direction, True
 
     def about_joint(self, part: int) -> Tensor:  # [3, 3] columns
         """A part's axes, that which is nearest to the direction of the first joint turned to it, and first."""
@@ -376,6 +405,21 @@ def _where_most_turn(
     middle = (apart.clamp(max=reach) * known).sum(dim=1).argmin()
     near = known & (apart[middle] < reach)
     return angle[near].mean() if near.any() else angle[middle], near
+
+
+def _square_to_all(
+    fixed: Tensor,  # [3] unit
+    moving: Tensor,  # [n, 3] unit
+    start: Tensor,  # [3] unit
+) -> tuple[Tensor, Tensor]:  # [3] unit, []
+    """The direction that a normal and all others are square to, and how far from it most of these are, in degrees."""
+    trust, axis = moving.new_ones(len(moving)), start
+    for _ in range(_ROUNDS):
+        weighted = (trust[:, None] * moving).mT @ moving + trust.sum() * torch.outer(fixed, fixed)
+        least = torch.linalg.eigh(weighted).eigenvectors[:, 0]
+        axis = least * (least @ axis).sign()
+        trust = 1 / ((moving @ axis).square() + math.radians(1) ** 2)
+    return axis, (moving @ axis).abs().clamp(max=1).asin().rad2deg().median()
 
 
 def _common_axis(

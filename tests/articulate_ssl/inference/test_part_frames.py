@@ -191,10 +191,18 @@ def test_joints_turn_far_if_that_is_asked_for(oven, monkeypatch, afar):
     torch.testing.assert_close(after.state, one.state + math.radians(30) * afar)
 
 
-def test_plates_say_how_they_are_turned_and_not_about_what():
+def test_plates_turn_about_what_all_of_them_are_square_to():
     """A laptop's base has nearly all of its faces on two sides: in its own plane its frame is not known."""
     frames, _ = _learnt(LAPTOP, _data(LAPTOP))
     assert frames.flat.tolist() == [True, True]
+    assert frames.measured.tolist() == [True]
+    assert _angle(frames.direction[0], torch.tensor([0.0, 1.0, 0.0])) < 1  # believed: 5
+
+
+def test_plates_that_stay_parallel_do_not_say_about_what_they_turn():
+    boxes, parents, lines, _, kind = LAPTOP
+    design = (boxes, parents, lines, [(-0.1, 0.1)], kind)
+    frames, _ = _learnt(design, _data(design))
     assert frames.measured.tolist() == [False]
 
 
