@@ -8,8 +8,8 @@ faces, the root is turned until it is square to them (a Manhattan frame, as of t
 
 Which parts have faces, and how these lie in canonical space, predictions of training clouds say, all together; and as
 two parts with faces are turned against each other about the joint between them, they say about which direction that is:
-of a box and what turns on it, by how its faces move; of two plates, whose hinge lies in both, by what all are square to.
-No label is read.
+of a box and what turns on it, by how faces move; of two plates, whose hinge lies in both, by what all are square
+to. No label is read.
 """
 
 from __future__ import annotations
@@ -144,9 +144,9 @@ class PartFrames(LateBuffers):
         known = faces.enough & own.enough
         if not known.any():
             return
-        fixed, side = (int(some.along(at)[known].mean(dim=0).argmax()) for some, at in ((faces, frame), part))
-        moving = (self.axes[parent] @ frame.mT @ turning)[known][:, :, side]
-        fixed = self.axes[parent][:, fixed]
+        sides = [int(some.along(at)[known].mean(dim=0).argmax()) for some, at in ((faces, frame), part)]
+        fixed = self.axes[parent][:, sides[0]]
+        moving = (self.axes[parent] @ frame.mT @ turning)[known][:, :, sides[1]]
         direction, off = _square_to_all(fixed, moving, believed)
         turned = (moving @ fixed).abs().clamp(max=1).acos().rad2deg().median()
         near = believed @ direction > math.cos(math.radians(FARTHEST))
