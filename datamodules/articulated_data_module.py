@@ -60,8 +60,9 @@ class ArticulatedDataModule(LightningDataModule):
         dense_in_fit: Deliver the dense arrays in training and validation too.
         calibration_set: Folder of the set whose training clouds calibrate metrics, if not this set's own: what the
             network was trained on, when it is tested on objects or views from elsewhere.
-        scans: Folder of a set of complete clouds of the same category, in which parts are discovered where this set's
-            clouds are depth views (`model.discovery.grouped`). It must be there, whether they are or not.
+        scans: Folder of a set of complete clouds of the same category, in which parts are discovered in the multi-state
+            setting (`model.discovery.grouped`) instead of this set's, which cannot serve where they are depth views. It
+            must be there, whether it is read or not.
         occupancy: Deliver occupancy samples in training and validation; the set must have them
             (`datamodules.occupancy`).
         verify: Compare every shard with its checksum when a stage begins.

@@ -18,7 +18,7 @@ class SetClouds:
     """See `recipes.recipe.TrainingClouds`. Which object a cloud shows is known from the recording; it is no label.
 
     Attributes:
-        data: The set, and where its clouds are depth views, the set of scans (`data.scans`).
+        data: The set, and the set of scans (`data.scans`), which depth views need.
     """
 
     data: ArticulatedDataModule

@@ -199,11 +199,24 @@ def test_plates_turn_about_what_all_of_them_are_square_to():
     assert _angle(frames.direction[0], torch.tensor([0.0, 1.0, 0.0])) < 1  # believed: 5
 
 
-def test_plates_that_stay_parallel_do_not_say_about_what_they_turn():
-    boxes, parents, lines, _, kind = LAPTOP
-    design = (boxes, parents, lines, [(-0.1, 0.1)], kind)
-    frames, _ = _learnt(design, _data(design))
-    assert frames.measured.tolist() == [False]
+@pytest.mark.parametrize(
+    ("most", "tilt", "measured"),
+    [(60, 0, True), (5, 0, False), (60, 10, False)],
+    ids=["turned", "nearly parallel", "the hinge is not in the plate"],
+)
+def test_plates_say_about_what_they_turn_if_that_is_clear(most, tilt, measured):
+    angle = torch.linspace(-most, most, 13)
+    still, turn = (
+        torch.eye(3).repeat(13, 1, 1),
+        _about_y(angle) @ roma.rotvec_to_rotmat(math.radians(tilt) * torch.tensor([1.0, 0.0, 0.0])),
+    )
+    # Of a plate: all normals are along the third axis of its frame.
+    body, part = (Faces(frame[:, :, 2][:, None].expand(-1, 40, -1), torch.ones(13, 40)) for frame in (still, turn))
+    frames, believed = PartFrames(2), torch.nn.functional.normalize(torch.tensor([0.05, 1.0, 0.05]), dim=0)
+    frames._measure_plates(0, (0, body, still), (part, turn), believed)
+    assert frames.measured.tolist() == [measured]
+    if measured:
+        assert _angle(frames.direction[0], torch.tensor([0.0, 1.0, 0.0])) < 0.1
 
 
 def test_a_door_that_bulges_is_a_plate_as_a_whole():
