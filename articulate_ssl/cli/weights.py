@@ -101,6 +101,8 @@ def _parser() -> argparse.ArgumentParser:
     test.set_defaults(do=_test)
 
     ablate = commands.add_parser("ablate", help="what is lost without each thing that was learnt after training")
+    whole = "what part discovery finds without each thing it does, anew, with nothing learnt after it: an hour"
+    ablate.add_argument("--discovery", action="store_true", help=whole)
     ablate.set_defaults(do=_ablate)
     columns = commands.add_parser("columns", help="no network, the network alone, and both: the same clouds")
     columns.set_defaults(do=_columns)
@@ -216,22 +218,22 @@ def _test(args: argparse.Namespace) -> int:
 
 
 def _ablate(args: argparse.Namespace) -> int:
-    from articulate_ssl.pretrained.ablation import Study, as_markdown
+    from articulate_ssl.pretrained import ablation, discovery_ablation
 
-    return _study(args, Study.run, as_markdown)
+    if args.discovery:
+        return _study(args, discovery_ablation.DiscoveryStudy, discovery_ablation.as_markdown)
+    return _study(args, ablation.Study, ablation.as_markdown)
 
 
 def _columns(args: argparse.Namespace) -> int:
     from articulate_ssl.pretrained.ablation import Study, columns_as_markdown
 
-    return _study(args, Study.columns, columns_as_markdown)
+    return _study(args, Study, columns_as_markdown, "columns")
 
 
-def _study(args: argparse.Namespace, work: Callable, as_table: Callable) -> int:
-    from articulate_ssl.pretrained.ablation import Study
-
+def _study(args: argparse.Namespace, study: Callable, as_table: Callable, work: str = "run") -> int:
     for weights in [weights for name in args.names for weights in _named(name)]:
-        found = work(Study(weights, args.seed, args.samples, args.build), _say)
+        found = getattr(study(weights, args.seed, args.samples, args.build), work)(_say)
         print(f"\n{weights.name}, data seed {args.seed}, {found[0][1]['samples']} clouds\n\n{as_table(found)}")
     return 0
 

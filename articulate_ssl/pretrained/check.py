@@ -132,8 +132,11 @@ def _allowed(quantity: str, card: dict[str, Any], fresh: dict[str, Any]) -> floa
     return max(chance, _TRIFLE_DEGREES if in_degrees else _TRIFLE_SHARE)
 
 
-def make_data(card: WeightsCard, seed: int, place: Path) -> None:
+def make_data(card: WeightsCard, seed: int, place: Path, training_objects: int = CALIBRATION_INSTANCES) -> None:
     """Data of another seed as the card says, in a folder `data` of a place; fewer training objects are enough.
+
+    Args:
+        training_objects: As many at most; by default those that calibration takes.
 
     Raises:
         CheckpointError: if the seed is the card's own, or no data can be made.
@@ -143,7 +146,7 @@ def make_data(card: WeightsCard, seed: int, place: Path) -> None:
     words = shlex.split(card.data["command"])[1:]  # `python` is this one
     words[words.index("--seed") + 1] = str(seed)
     train = words.index("--train-instances") + 1
-    words[train] = str(min(int(words[train]), CALIBRATION_INSTANCES))
+    words[train] = str(min(int(words[train]), training_objects))
     place.mkdir(parents=True, exist_ok=True)
     log = place / "data.log"
     with log.open("w") as output:
