@@ -62,6 +62,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         + "; ".join(f"{view}: {what}" for view, what in VIEWS.items())
         + "; auto (default): whichever weights explain the scan better",
     )
+    parser.add_argument(
+        "--on-table",
+        action="store_true",
+        help="the scan also shows what the object stands on: find that surface, and take the largest thing on it",
+    )
     parser.add_argument("--out", type=Path, help="folder for the results (default: <name of the scan>-prediction)")
     parser.add_argument("--device", default="cpu", help="cpu (default), cuda, cuda:1, …")
     parser.add_argument(
@@ -137,8 +142,9 @@ def _predict(args: argparse.Namespace, device: torch.device) -> tuple[list[ScanP
     from articulate_ssl.pretrained.estimator import load
     from articulate_ssl.pretrained.ranking import ranked
     from datamodules.point_cloud_io import load_point_cloud
+    from datamodules.standing_object import load_standing_object
 
-    cloud = load_point_cloud(args.cloud)
+    cloud = load_standing_object(args.cloud) if args.on_table else load_point_cloud(args.cloud)
     estimator = load(args.category or args.ckpt, None if args.view == AUTO else args.view, device)
     several = len(estimator.estimators) > 1
     progress = track(

@@ -143,6 +143,18 @@ def test_a_bad_scan_exits_2_with_one_line_that_names_it(scan_folder, module, cap
     assert not (scan_folder / "bad-prediction").exists()
 
 
+def test_what_the_object_stands_on_is_left_out_if_asked(scan_folder, module, caplog):
+    low, high = (scan := np.load("scan.npy")).min(axis=0), scan.max(axis=0)
+    across = np.random.default_rng(0).uniform(2 * low - high, 2 * high - low, size=(4000, 3))
+    np.save("scene.npy", np.concatenate([scan, across * [1, 1, 0] + [0, 0, low[2] - 1]]))
+    assert predict("scene.npy", "--ckpt", "laptop.ckpt", "--out", "cut", "--on-table") == 0
+    assert predict("scan.npy", "--ckpt", "laptop.ckpt", "--out", "alone") == 0
+    cut, alone = (json.loads((scan_folder / name / "prediction.json").read_text()) for name in ("cut", "alone"))
+    counts = [sum(part["num_points"] for part in summary["parts"]) for summary in (cut, alone)]
+    assert 0.95 * len(scan) < counts[0] <= len(scan) == counts[1]
+    assert "scene.npy: " in caplog.text and "points left out: what the object stands on" in caplog.text
+
+
 def test_a_missing_scan_exits_2(scan_folder, module, capsys):
     assert_refused(capsys, ["none.ply", "--ckpt", "laptop.ckpt"], "none.ply: no such file")
 
