@@ -47,7 +47,7 @@ OBJECT_OPTIONS = {
     "occupancy": 0,
 }  # fmt: skip
 # Options of scans only.
-SCAN_OPTIONS = {"parts": None, "joint": None, "normalise": None}
+SCAN_OPTIONS = {"parts": None, "joint": None, "normalise": None, "on_table": None}
 
 SetPlan = ObjectSet | ScanSet
 
@@ -180,6 +180,8 @@ def _parser() -> argparse.ArgumentParser:
         help="scale by the median size of an object's scans (default of complete ones), by each scan's own (default of "
         "depth views), or take points exactly as they are",
     )
+    what = "scans also show what their object stands on: find that surface, and take the largest thing on it"
+    add("--on-table", action="store_true", help=what)
     return parser
 
 
@@ -252,6 +254,7 @@ def _scan_options(arguments: argparse.Namespace) -> ScanSetOptions:
         rotations=arguments.rotations,
         points=arguments.points,
         normalise=arguments.normalise or ("scan" if arguments.view == "partial" else "object"),
+        on_table=arguments.on_table,
     )
 
 

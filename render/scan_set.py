@@ -17,6 +17,7 @@ import numpy as np
 from datamodules.manifest import SPLITS, Manifest
 from datamodules.point_cloud_io import SUFFIXES, read_scan
 from datamodules.shards import SHARD_ARRAYS, UNLABELLED_ARRAYS, sha256_of, write_shard
+from datamodules.standing_object import standing_object
 from render.category import CategorySpec, parse_category
 from render.journal import Contents, contents_of, generator_version
 from render.object_set import shard_entries
@@ -55,6 +56,8 @@ class ScanSetOptions:
         points: Points per cloud.
         normalise: `object`: centred, and scaled by the median size of the scans of its object; `scan`: by its own size;
             `none`: taken as it is, to the bit and in its order, because the user has done all that.
+        on_table: Scans also show what their object stands on, from which it is cut out. None, as sets from before there
+            was this option have it, stands for no.
     """
 
     category: str
@@ -68,6 +71,7 @@ class ScanSetOptions:
     rotations: int
     points: int
     normalise: str
+    on_table: bool | None = None
 
     source = SOURCE
 
@@ -92,6 +96,7 @@ class ScanSetOptions:
         """
         path = os.path.join(self.root, scan)
         read = read_scan(path)
+        read = standing_object(path, read) if self.on_table else read
         try:
             if self.view == "partial":
                 refuse_camera(read.points)

@@ -89,6 +89,30 @@ def test_the_stored_points_are_those_of_the_scan_in_even_order(root, tmp_path):
     assert apart[0] > 2 * apart[1]  # farthest points first
 
 
+def test_the_table_is_cut_off_if_asked_and_the_set_is_another_one(root, tmp_path, capsys):
+    with_table = tmp_path / "with_table"
+    for index in range(5):
+        folder = with_table / f"object-{index}"
+        folder.mkdir(parents=True)
+        corner = np.array([300.0, 300.0, 0.0])
+        table = np.random.default_rng(index).uniform(-corner, corner, (1000, 3)) - [0, 0, 15]
+        np.save(folder / "a.npy", np.concatenate([scan(index), table]))
+    cut = read_shard(make(with_table, tmp_path, "--on-table") / "train" / "shard-00000.npz")
+    metric = cut["points"] * cut["scale"][:, None, None] + cut["center"][:, None]
+    assert metric[..., 2].min() > -14 and np.abs(metric).max() < 120
+    assert "points left out: what the object stands on" in capsys.readouterr().err
+    make(with_table, tmp_path, code=2)
+    assert "on_table True, now None" in capsys.readouterr().err
+
+
+def test_a_set_from_before_tables_were_cut_off_is_the_same(root, tmp_path):
+    folder = make(root, tmp_path)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    del manifest["options"]["on_table"]
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    make(root, tmp_path)
+
+
 def test_scans_of_an_object_share_a_scale_and_others_have_their_own(root, tmp_path):
     train = read_shard(make(root, tmp_path) / "train" / "shard-00000.npz")
     scale = train["scale"]
@@ -382,6 +406,7 @@ def test_a_category_can_be_a_file_of_the_users(root, tmp_path):
         (["--category", "laptop", "--parts", "2", "--joint", "revolute"], "leave --parts and --joint out"),
         (["--category", "laptop", "--states", "3"], "takes no --states"),
         (["--category", "laptop", "--variant", "x"], "takes no --variant"),
+        (["--category", "laptop", "--on-table"], "a.npy: it has no flat surface below an object"),
         (["--category", "laptop", "--view", "partial", "--protocol", "eap"], "--protocol eap"),
         (["--category", "laptop", "--normalise", "none"], "has 400 points; --normalise none needs --points 4096"),
         (["--category", "nowhere.yaml"], "nowhere.yaml: cannot be read"),
