@@ -19,7 +19,7 @@ from datamodules.point_cloud_io import MIN_POINTS, PointCloudError, Scan, read_s
 _SAMPLE = 20000  # points of a scan that planes and pieces are looked for in
 _PLANES = 6  # the largest that are looked at
 _ITERATIONS = 1000  # of RANSAC, for each of them
-_THICK = 0.005  # of the scan's extent: how far points of a plane may be from it, before its own noise is known
+_THICK = 0.0025  # of the scan's extent: how far points of a plane may be from it, before its own noise is known
 _FEWEST = 0.05  # of the points; a smaller plane is no table
 # Cosine of a plane's upward normal to the upward direction of a camera that is held upright, and may look down by 75
 # degrees.
@@ -134,9 +134,9 @@ def _planes(
         above = plane.offset if camera else plane.height(np.median(others if len(others) else rest, axis=0))
         if above < 0:
             plane = plane._replace(normal=-plane.normal, offset=-plane.offset)
-        plane = _fitted(plane, rest[np.abs(plane.height(rest)) <= 2 * tolerance])
+        plane = _fitted(plane, rest)
         upright = -plane.normal[1] > _UPRIGHT or not camera
-        if upright and len(plane.points) >= _FEWEST * len(sample):
+        if upright and len(inliers) >= _FEWEST * len(sample):
             found.append(plane)
         rest = others
     return found
@@ -144,7 +144,7 @@ def _planes(
 
 def _fitted(
     plane: _Plane,
-    points: np.ndarray,  # [n, 3] near it, on either side
+    points: np.ndarray,  # [n, 3]
 ) -> _Plane:
     """The plane of least squares through those points that its own noise explains, which is known from below it.
 
@@ -152,7 +152,8 @@ def _fitted(
     """
     for _ in range(_FITS):
         height = plane.height(points)
-        noise = max(1.4826 * float(np.median(np.append(-height[height <= 0], 0.0))), _EXACT * plane.extent)
+        below = height[(height <= 0) & (height >= -_NOISE * plane.noise)]
+        noise = max(1.4826 * float(np.median(np.append(-below, 0.0))), _EXACT * plane.extent)
         near = points[np.abs(height) <= _CLOSE * noise]
         if len(near) < MIN_POINTS:
             break
