@@ -138,7 +138,7 @@ def _planes(
         upright = -plane.normal[1] > _UPRIGHT or not camera
         if upright and len(inliers) >= _FEWEST * len(sample):
             found.append(plane)
-        rest = others
+        rest = rest[np.abs(plane.height(rest)) > _CLOSE * plane.noise]
     return found
 
 
