@@ -8,7 +8,6 @@ seed of their own: those of the card are for the card.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,14 +15,12 @@ from typing import Any
 
 from articulate_ssl.inference.pose_estimation import PoseEstimator
 from articulate_ssl.pretrained.check import data_of, make_data, tested
-from articulate_ssl.pretrained.fingerprint import fingerprint
 from articulate_ssl.pretrained.markdown_table import cells_of, table_of
+from articulate_ssl.pretrained.study import WeightsStudy
 from articulate_ssl.training.checkpoint import load_module
 from articulate_ssl.training.columns import SECONDS, TITLES
 from articulate_ssl.training.module import ArticulatedPoseModule
-from articulate_ssl.training.shipped_weights import ShippedWeights
-from articulate_ssl.training.weights_card import CARD_SUFFIX, WeightsCard
-from datamodules.atomic import atomic_write
+from articulate_ssl.training.weights_card import WeightsCard
 
 NOTHING = "nothing"
 
@@ -130,21 +127,8 @@ ABLATIONS = (
 )
 
 
-@dataclass(frozen=True)
-class Study:
-    """Of one set of weights.
-
-    Attributes:
-        weights: Which.
-        seed: Of the data.
-        samples: Test clouds, at most, spread over objects and states.
-        build: Folder for data and results; what is finished there is not repeated unless weights or code change.
-    """
-
-    weights: ShippedWeights
-    seed: int
-    samples: int
-    build: Path
+class Study(WeightsStudy):
+    """What things are worth that weights have learnt, and the network, and registration."""
 
     def run(self, say: Callable[[str], None]) -> list[tuple[str, dict[str, Any]]]:
         """What is left out, and the content of `metrics.json` without it.
@@ -173,28 +157,21 @@ class Study:
         return [(TITLES[name], column) for name, column in metrics["columns"].items()]
 
     def _with_data(self, say: Callable[[str], None]) -> tuple[WeightsCard, Path]:
-        card = WeightsCard.load(self.weights.file.with_suffix(CARD_SUFFIX))
-        place = self.build / f"{self.weights.name}-seed-{self.seed}"
-        if not (place / "made").is_file():
-            say(f"{self.weights.name}: data of seed {self.seed} …")
-            make_data(card, self.seed, place)
-            (place / "made").touch()
+        card, place = self.card(), self.build / f"{self.weights.name}-seed-{self.seed}"
+        self.made(place, lambda: make_data(card, self.seed, place), say)
         return card, place
 
     def _tested(
         self, name: str, change: Callable[[ArticulatedPoseModule], None], card: WeightsCard, place: Path
     ) -> dict[str, Any]:
         """The content of `metrics.json` of weights that something was changed of, unless it is known."""
-        about = fingerprint(self.weights.file, self.samples)
-        note = place / f"{name}.json"
-        if note.is_file() and (known := json.loads(note.read_text()))["of"] == about:
-            return known["metrics"]
-        module = load_module(self.weights.file)
-        change(module)
-        metrics = tested(module, data_of(card, place / "data", module.num_points, self.samples), place)
-        with atomic_write(note) as file:
-            file.write(json.dumps({"of": about, "metrics": metrics}).encode())
-        return metrics
+
+        def measure() -> dict[str, Any]:
+            module = load_module(self.weights.file)
+            change(module)
+            return tested(module, data_of(card, place / "data", module.num_points, self.samples), place)
+
+        return self.kept(place / f"{name}.json", measure)
 
 
 def _without(ablation: Ablation) -> Callable[[ArticulatedPoseModule], None]:

@@ -1,6 +1,6 @@
 """What part discovery finds without each of the things that it does: nothing is learnt after it, no network trained.
 
-`ablation` leaves out what weights have learnt. Here one option of discovery is another at a time: parts and joints are
+`ablation` leaves out what weights have learnt. Here discovery lacks one thing at a time: parts and joints are
 found anew in the same training clouds, of a data seed of their own, and the category's shape as it was handed over is
 searched in the same test clouds (`PoseEstimator.search`), calibrated and scored as ever.
 """
@@ -23,21 +23,18 @@ from lightning import seed_everything
 from articulate_ssl.discovery.discover import DiscoveryError
 from articulate_ssl.discovery.options import PROPOSALS
 from articulate_ssl.geometry.screw import PRISMATIC
-from articulate_ssl.inference.prediction import Prediction, concatenate
+from articulate_ssl.inference.prediction import concatenate
 from articulate_ssl.metrics.articulated_pose import ArticulatedPoseMetrics
 from articulate_ssl.metrics.calibration import calibrate
 from articulate_ssl.ops.progress import announced, shown
 from articulate_ssl.pretrained.ablation import NOTHING
 from articulate_ssl.pretrained.check import make_data
-from articulate_ssl.pretrained.fingerprint import fingerprint
 from articulate_ssl.pretrained.markdown_table import cells_of, table_of
+from articulate_ssl.pretrained.study import WeightsStudy
 from articulate_ssl.training.module import ArticulatedPoseModule
 from articulate_ssl.training.set_clouds import SetClouds
-from articulate_ssl.training.shipped_weights import ShippedWeights
-from articulate_ssl.training.weights_card import CARD_SUFFIX, WeightsCard
+from articulate_ssl.training.weights_card import WeightsCard
 from datamodules.articulated_data_module import ArticulatedDataModule
-from datamodules.articulated_dataset import split_labels
-from datamodules.atomic import atomic_write
 from datamodules.manifest import set_folder
 
 MINUTES = "minutes"  # of discovery
@@ -95,21 +92,8 @@ DISCOVERY_ABLATIONS = (
 )
 
 
-@dataclass(frozen=True)
-class DiscoveryStudy:
-    """Of the discovery that a set of weights begins with.
-
-    Attributes:
-        weights: Which.
-        seed: Of the data; scans, where there are any, are of the next.
-        samples: Test clouds, at most, spread over objects and states.
-        build: Folder for data and results; what is finished there is not repeated unless weights or code change.
-    """
-
-    weights: ShippedWeights
-    seed: int
-    samples: int
-    build: Path
+class DiscoveryStudy(WeightsStudy):
+    """Of the discovery that a set of weights begins with."""
 
     def run(self, say: Callable[[str], None]) -> list[tuple[str, dict[str, Any]]]:
         """What is left out, and metrics without it, with the `minutes` that discovery took.
@@ -119,29 +103,27 @@ class DiscoveryStudy:
         Raises:
             CheckpointError: if the weights have no card, a seed is the card's own, or no data can be made.
         """
-        card = WeightsCard.load(self.weights.file.with_suffix(CARD_SUFFIX))
-        self._make_data(card, say)
+        card = self.card()
+        self.made(self._place, lambda: self._make_data(card), say)
         module, _ = self._told(card)
         found = []
         for ablation in (one for one in DISCOVERY_ABLATIONS if one.applies(module)):
             say(f"{self.weights.name}: discovery without {ablation.name} …")
-            found.append((ablation.name, self._known(ablation, card)))
+            note = self._place / f"without {ablation.name}.json"
+            metrics = self.kept(note, lambda own=ablation.options: self._discovered(card, own), ablation.options)
+            found.append((ablation.name, metrics))
         return found
 
     @property
     def _place(self) -> Path:
         return self.build / f"{self.weights.name}-discovery-seed-{self.seed}"
 
-    def _make_data(self, card: WeightsCard, say: Callable[[str], None]) -> None:
-        if (self._place / "made").is_file():
-            return
-        say(f"{self.weights.name}: data of seed {self.seed} …")
+    def _make_data(self, card: WeightsCard) -> None:
         objects = _OBJECTS if card.setting is None else _OBJECTS_IN_STATES
         make_data(card, self.seed, self._place, objects)
         if "scans" in card.data:
             scans = replace(card, data=card.data | {"command": card.data["scans"]})
             make_data(scans, self.seed + 1, self._place / "scans", objects)
-        (self._place / "made").touch()
 
     def _told(self, card: WeightsCard, *options: str) -> tuple[ArticulatedPoseModule, ArticulatedDataModule]:
         """Module and data as the card's training has them before its first step, but for some options."""
@@ -157,17 +139,9 @@ class DiscoveryStudy:
         built = parser.instantiate(config)
         return built.model, built.data
 
-    def _known(self, ablation: DiscoveryAblation, card: WeightsCard) -> dict[str, Any]:
-        """Metrics without one thing, unless they lie here."""
-        about = fingerprint(self.weights.file, ablation.options, self.samples)
-        note = self._place / f"without {ablation.name}.json"
-        if note.is_file() and (known := json.loads(note.read_text()))["of"] == about:
-            return known["metrics"]
+    def _discovered(self, card: WeightsCard, options: Sequence[str]) -> dict[str, Any]:
         with shown():
-            metrics = _discovered(*self._told(card, *ablation.options))
-        with atomic_write(note) as file:
-            file.write(json.dumps({"of": about, "metrics": metrics}).encode())
-        return metrics
+            return _discovered(*self._told(card, *options))
 
 
 def _parser() -> ArgumentParser:
@@ -195,17 +169,12 @@ def _discovered(module: ArticulatedPoseModule, data: ArticulatedDataModule) -> d
     minutes = (time.monotonic() - start) / 60
     known = [module.whole(batch) for batch in data.calibration_dataloader(_CALIBRATION)]
     labels = {name: torch.cat([batch[name] for batch in known]) for name in known[0]}
-    calibration = calibrate(concatenate([_searched(module, batch) for batch in known]), labels)
+    calibration = calibrate(concatenate([module.search_batch(batch) for batch in known]), labels)
     metrics = ArticulatedPoseMetrics(calibration)
     batches = [module.whole(batch) for batch in data.test_dataloader()]
     for batch in announced(log, "test clouds", batches):
-        metrics.update(_searched(module, batch), batch)
+        metrics.update(module.search_batch(batch), batch)
     return metrics.compute() | {MINUTES: minutes}
-
-
-def _searched(module: ArticulatedPoseModule, batch: dict[str, torch.Tensor]) -> Prediction:
-    inputs = split_labels(batch)[0]
-    return module.estimator.search(inputs["points"], inputs["dense_points"])
 
 
 def as_markdown(found: Sequence[tuple[str, dict[str, Any]]]) -> str:

@@ -351,7 +351,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         predictions = [self.predict_batch(batch) for batch in shown]
         self.test_report = TestReport(predictions, batches, self.orientation.limited).to(self.device)
         if self.inference.columns:
-            self.test_columns = TestColumns(self.predict_batch, self._search, self.inference.refine, batches)
+            self.test_columns = TestColumns(self.predict_batch, self.search_batch, self.inference.refine, batches)
 
     def test_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
         """Predict, then compare."""
@@ -370,7 +370,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         inputs = split_labels(batch)[0]
         return self.predict_standing(inputs["points"], refine, inputs["dense_points"])
 
-    def _search(self, batch: dict[str, Tensor]) -> Prediction:
+    def search_batch(self, batch: dict[str, Tensor]) -> Prediction:
+        """The same without the network (`PoseEstimator.search`)."""
         inputs = split_labels(batch)[0]
         return self.standing_part.stood(self.estimator.search(inputs["points"], inputs["dense_points"]))
 
