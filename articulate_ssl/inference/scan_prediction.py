@@ -20,6 +20,7 @@ from articulate_ssl.ops.kd_tree import kd_tree
 
 JOINT_TYPE_NAMES = ("revolute", "prismatic")
 UNLIKE = 0.99  # share of the training clouds that are explained better than a scan that is warned of
+_BEYOND = 0.1  # of the width of a joint's range, outside it, from which a state is warned of (log, step 264)
 
 
 @dataclass(frozen=True)
@@ -148,13 +149,28 @@ class ScanPrediction:
 
     @property
     def warning(self) -> str:
-        """About a scan that is unlike what the network was trained on; empty if there is nothing to say."""
-        if self.unlike is None or self.unlike < UNLIKE:
+        """About a scan that is unlike what the network was trained on, "this scan is ..."; empty if nothing is odd."""
+        if self.unlike is None:
+            return ""
+        odd = [f"explained with {joint}, which no training cloud had" for joint in self._joints_beyond()]
+        if self.unlike >= UNLIKE:
+            odd.append(f"explained worse than {UNLIKE:.0%} of the training clouds")
+        if not odd:
             return ""
         return (
-            f"explained worse than {UNLIKE:.0%} of the training clouds: it may be another object, cut off, cluttered, "
-            "or turned as none was; look before you use it"
+            f"{' and '.join(odd)}: it may be another object, cut off, cluttered, or turned, opened or shut as none "
+            "was; look before you use it"
         )
+
+    def _joints_beyond(self) -> list[str]:
+        """Joints whose states are well outside what training showed, each with its state and that."""
+        said = []
+        for joint in self.joints:
+            low, high = joint.limits
+            if max(low - joint.state, joint.state - high) > _BEYOND * (high - low):
+                state, *seen = (_measure(joint, x) for x in (joint.state, low, high))
+                said.append(f"{joint.name} at {state} (of {' to '.join(seen)})")
+        return said
 
     def articulate(
         self,
@@ -195,9 +211,7 @@ class ScanPrediction:
     def __repr__(self) -> str:
         """One line, without arrays."""
         joints = ", ".join(
-            f"{j.name} {j.type} {j.child} on {j.parent} at "
-            + (f"{math.degrees(j.state):.1f}°" if j.type == "revolute" else f"{j.state:.4g}")
-            for j in self.joints
+            f"{j.name} {j.type} {j.child} on {j.parent} at {_measure(j, j.state, digits=1)}" for j in self.joints
         )
         sure = "" if self.probability is None else f", probability {self.probability:.2f}"
         return f"<ScanPrediction: {self.category}, {len(self.cloud)} points, {joints}{sure}>"
@@ -247,6 +261,11 @@ def in_scan_frame(
         unlike=estimate.unlike,
         upright=upright,
     )
+
+
+def _measure(joint: Joint, state: float, digits: int = 0) -> str:
+    """A state with its unit: degrees, or a length in the units of the scan."""
+    return f"{math.degrees(state):.{digits}f}°" if joint.type == JOINT_TYPE_NAMES[0] else f"{state:.4g}"
 
 
 def _check(prediction: Prediction, checkpoint: str | None) -> None:

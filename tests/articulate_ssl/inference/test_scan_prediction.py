@@ -1,4 +1,5 @@
 import json
+import re
 
 import numpy as np
 import pytest
@@ -59,6 +60,28 @@ def test_only_what_a_joint_moves_moves():
 def test_states_that_do_not_fit_the_joints_are_refused(states):
     with pytest.raises(ValueError, match="1 finite joint states are needed"):
         result_of(synthetic.laptop).articulate(states)
+
+
+@pytest.mark.parametrize(
+    ("make", "limits", "said"),
+    [  # the laptop's lid is at 1.2 radians, the drawers are .2, .1 and 0 out
+        (synthetic.laptop, [0.0, 1.1], ""),
+        (synthetic.laptop, [0.0, 0.9], r"joint_0 at 69° \(of 0° to 52°\), which no training cloud had"),
+        (synthetic.laptop, [1.6, 2.6], r"joint_0 at 69° \(of 92° to 149°\)"),
+        (synthetic.drawer, [0.0, 0.095], r"with joint_0 at 0.08 \(of 0 to 0.038\), which no training cloud had: it may"),
+    ],
+)
+def test_joints_well_beyond_what_training_showed_are_warned_of(make, limits, said):
+    states = make()[0].joint_state.shape[1]
+    result = result_of(make, state_range=torch.tensor([limits]).repeat(states, 1), unlike=0.5)
+    assert re.search(said, result.warning) if said else result.warning == ""
+    assert "explained worse" not in result.warning
+    assert result_of(make, state_range=torch.tensor([limits]).repeat(states, 1)).warning == ""  # ranges not learnt
+
+
+def test_both_warnings_are_one_sentence():
+    warning = result_of(synthetic.laptop, state_range=torch.tensor([[0.0, 0.9]]), unlike=0.995).warning
+    assert "which no training cloud had and explained worse than 99% of the training clouds: it may be" in warning
 
 
 def test_parts_and_joints_are_those_of_the_json():

@@ -47,7 +47,8 @@ def test_without_a_rival_or_a_probability_nothing_is_made_up():
 
 @pytest.mark.parametrize(("unlike", "warned"), [(None, False), (0.5, False), (0.99, True)])
 def test_a_scan_unlike_the_training_is_warned_about(unlike, warned):
-    assert bool(scene_of(result_of(synthetic.laptop, unlike=unlike)).warning) == warned
+    result = result_of(synthetic.laptop, state_range=torch.tensor([[0.5, 1.5]]), unlike=unlike)
+    assert bool(scene_of(result).warning) == warned
 
 
 def test_a_dense_scan_is_thinned_with_its_parts(monkeypatch):
