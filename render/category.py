@@ -139,6 +139,20 @@ class CategorySpec:
         """Options of the procedural design: those of the variant."""
         return self.variants[self.variant] if self.variant else {}
 
+    def with_hinges_within(self, lower: float, upper: float) -> CategorySpec:
+        """The category with states of its revolute joints in [lower, upper), radians; its rest state stays.
+
+        Raises:
+            ValueError: if `lower` is not below `upper`; if it has no revolute joint, or takes those of every object as
+                they are.
+        """
+        if not lower < upper:
+            raise ValueError(f"a hinge's states lie between two angles, the smaller one first, not {lower} and {upper}")
+        if not any(joint.type == REVOLUTE for joint in self.joints):
+            raise ValueError(f"category {self.name!r} has no hinges of its own, whose states could be others")
+        joints = [replace(j, lower=lower, upper=upper) if j.type == REVOLUTE else j for j in self.joints]
+        return replace(self, joints=tuple(joints))
+
     def of(self, instance: ArticulatedObject) -> CategorySpec:
         """The specification itself; for `articulated`, one with the parts of the instance and its joints' limits."""
         if self.parts:

@@ -44,7 +44,7 @@ from render.training_config import joint_type_of, write_training_config
 # Options of posed objects only, and their defaults; scans have been posed and seen already.
 OBJECT_OPTIONS = {
     "variant": None, "states": 100, "views": 10, "resolution": None, "renderer": "auto", "noise_std": 0.0,
-    "occupancy": 0,
+    "occupancy": 0, "range_deg": None,
 }  # fmt: skip
 # Options of scans only.
 SCAN_OPTIONS = {"parts": None, "joint": None, "normalise": None, "on_table": None}
@@ -160,6 +160,13 @@ def _parser() -> argparse.ArgumentParser:
     group = parser.add_argument_group("posed objects, all sources but clouds", argument_default=argparse.SUPPRESS)
     add = group.add_argument
     add("--variant", help="of the category's procedural designs, as its specification names it: both_sides of safe")
+    add(
+        "--range-deg",
+        type=float,
+        nargs=2,
+        metavar=("LOW", "HIGH"),
+        help="states of hinges in degrees (default: as the category says; 0 is closed, or of eyeglasses unfolded)",
+    )
     add("--states", type=at_least(1), help="articulation states per instance (default: 100)")
     add("--views", type=at_least(1), help="depth views of each articulation state (default: 10)")
     add(
@@ -234,6 +241,7 @@ def _object_options(arguments: argparse.Namespace) -> SetOptions:
         renderer=choose_renderer(arguments.renderer) if arguments.view == "partial" else None,
         variant=arguments.variant,
         specification=None if built_in else category_text(arguments.category)[1],
+        range_deg=None if arguments.range_deg is None else tuple(arguments.range_deg),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from functools import lru_cache
+from math import radians
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,7 @@ class SetOptions:
         renderer: One of `render.partial_cloud.RENDERERS` for partial views, None for complete clouds.
         variant: Of the category's procedural designs; None for the category itself.
         specification: YAML of a user's own category; None for a built-in one.
+        range_deg: Lowest and highest state of hinges, degrees, in place of the category's; None for those.
     """
 
     category: str
@@ -63,13 +65,16 @@ class SetOptions:
     renderer: str | None
     variant: str | None = None
     specification: str | None = None
+    range_deg: tuple[float, float] | None = None
 
     @property
     def spec(self) -> CategorySpec:
         """The category."""
         if self.specification is None:
-            return load_category(self.category, self.variant)
-        return parse_category(self.category, self.specification, self.variant)
+            spec = load_category(self.category, self.variant)
+        else:
+            spec = parse_category(self.category, self.specification, self.variant)
+        return spec if self.range_deg is None else spec.with_hinges_within(*map(radians, self.range_deg))
 
     def open(self) -> Source:
         """Where the objects come from.

@@ -134,8 +134,12 @@ def generate_arguments(manifest: Manifest) -> list[str]:
     own = ("rotations",) if manifest.view == "complete" else ("protocol", "views")
     names = ("category", "view", "seed", "train_instances", "test_instances", "states", *own)
     options = {name: manifest.options[name] for name in names}
-    options |= {name: manifest.options[name] for name in ("variant", "noise_std") if manifest.options.get(name)}
-    return [word for name, value in options.items() for word in (f"--{name.replace('_', '-')}", str(value))]
+    special = ("variant", "range_deg", "noise_std")
+    options |= {name: manifest.options[name] for name in special if manifest.options.get(name)}
+    words = []
+    for name, value in options.items():
+        words += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, list) else [value])]
+    return words
 
 
 def weaknesses(

@@ -47,6 +47,18 @@ def test_a_variant_changes_the_design_and_nothing_else():
         load_category("oven", "both_sides")
 
 
+def test_hinges_may_be_asked_for_in_other_states_and_nothing_else_changes():
+    oven = load_category("oven")
+    closed = oven.with_hinges_within(0.0, pi / 4)
+    assert (closed.joints[0].lower, closed.joints[0].upper, closed.joints[0].rest) == (0.0, pi / 4, 0.0)
+    assert replace(closed, joints=oven.joints) == oven
+    with pytest.raises(ValueError, match="the smaller one first, not 1 and 1"):
+        oven.with_hinges_within(1, 1)
+    for name in ("drawer", "articulated"):
+        with pytest.raises(ValueError, match=f"'{name}' has no hinges of its own"):
+            load_category(name).with_hinges_within(0, 1)
+
+
 def test_laptop_range_is_within_the_limits_of_the_hinge():
     spec, laptop = load_category("laptop"), box_laptop()
     np.testing.assert_allclose(np.rad2deg(spec.sampled_ranges(laptop)), [[9, 99]])

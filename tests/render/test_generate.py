@@ -147,6 +147,18 @@ def test_a_variant_is_recorded_and_not_mixed_with_others(tmp_path, capsys):
     assert "'oven' has no variant 'both_sides'" in capsys.readouterr().err
 
 
+def test_doors_are_as_far_open_as_asked_for_and_not_mixed_with_others(tmp_path, capsys):
+    folder = make(tmp_path, "--range-deg", "0", "30", category="oven")
+    state = np.rad2deg(read_shard(folder / "train" / "shard-00000.npz")["joint_state"])
+    assert state.min() >= -1e-4 and state.max() < 30
+    assert Manifest.load(folder).options["range_deg"] == [0, 30]
+    counts = ["--train-instances", "2", "--test-instances", "1", "--workers", "1", *SMALL]
+    assert main(["--category", "oven", "--out", str(tmp_path), *counts]) == 2
+    assert "range_deg [0.0, 30.0], now None" in capsys.readouterr().err
+    assert main(["--category", "drawer", "--out", str(tmp_path), "--range-deg", "0", "30"]) == 2
+    assert "'drawer' has no hinges of its own" in capsys.readouterr().err
+
+
 def test_moving_a_part_about_its_joint_lands_on_the_cloud_of_another_state(complete_set):
     """Every point of one state's cloud, moved by the state difference, lies on the surface the other cloud samples."""
     shard = {

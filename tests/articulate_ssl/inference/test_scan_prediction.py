@@ -68,7 +68,11 @@ def test_states_that_do_not_fit_the_joints_are_refused(states):
         (synthetic.laptop, [0.0, 1.1], ""),
         (synthetic.laptop, [0.0, 0.9], r"joint_0 at 69° \(of 0° to 52°\), which no training cloud had"),
         (synthetic.laptop, [1.6, 2.6], r"joint_0 at 69° \(of 92° to 149°\)"),
-        (synthetic.drawer, [0.0, 0.095], r"with joint_0 at 0.08 \(of 0 to 0.038\), which no training cloud had: it may"),
+        (
+            synthetic.drawer,
+            [0.0, 0.095],
+            r"with joint_0 at 0.08 \(of 0 to 0.038\), which no training cloud had: it may",
+        ),
     ],
 )
 def test_joints_well_beyond_what_training_showed_are_warned_of(make, limits, said):
