@@ -20,7 +20,7 @@ from articulate_ssl.ops.kd_tree import kd_tree
 
 JOINT_TYPE_NAMES = ("revolute", "prismatic")
 UNLIKE = 0.99  # share of the training clouds that are explained better than a scan that is warned of
-_BEYOND = 0.1  # of the width of a joint's range, outside it, from which a state is warned of (log, step 264)
+_BEYOND = 0.2  # of the width of a joint's range, outside it, from which a state is warned of (log, step 264)
 
 
 @dataclass(frozen=True)

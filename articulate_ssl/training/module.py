@@ -46,6 +46,7 @@ from articulate_ssl.training.schedule import ScheduleOptions
 from articulate_ssl.training.set_clouds import SetClouds
 from articulate_ssl.training.test_report import TestReport
 from datamodules.articulated_dataset import split_labels
+from datamodules.manifest import Manifest
 
 log = logging.getLogger(__name__)
 
@@ -251,7 +252,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
                 network.mixed_precision = mixed
 
     def on_train_start(self) -> None:
-        """Remember how many points a cloud has; stage 0 starts from one of them."""
+        """Refuse data that move farther than the model does; stage 0 starts from one of their clouds."""
+        _require_range(self.trainer.datamodule.manifest, self.hparams.state_range)
         self.num_points = self.trainer.datamodule.hparams.num_points
         if self.rigid is not None and self.global_step == 0:
             self.rigid.start_from(SetClouds(self.trainer.datamodule).clouds(1)[0].to(self.device))
@@ -396,6 +398,16 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
 def _plain(value: Any) -> Any:
     """An option as a checkpoint may hold it."""
     return asdict(value) if is_dataclass(value) else value
+
+
+def _require_range(manifest: Manifest, state_range: float) -> None:
+    """Joint limits of that width are learnt: what moves farther would be taken for something else, without a word."""
+    degrees = manifest.options.get("range_deg")
+    if degrees is not None and (width := math.radians(degrees[1] - degrees[0])) > state_range + 1e-3:
+        raise ValueError(
+            f"hinges of the training set move by {degrees[1] - degrees[0]:g} degrees (--range-deg), those of the model "
+            f"by {math.degrees(state_range):.0f}: train with --model.state_range {width:.4f}"
+        )
 
 
 def _check(

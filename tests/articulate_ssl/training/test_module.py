@@ -1,5 +1,6 @@
 """The LightningModule on a tiny data set: what it must not depend on, what trains, and how it resumes."""
 
+import math
 from dataclasses import fields, replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from articulate_ssl.training.checkpoint import load_module
 from articulate_ssl.training.recipes.recipe import Outcome
 from articulate_ssl.training.set_clouds import SetClouds
 from datamodules.articulated_dataset import LABEL_ARRAYS, split_labels
+from datamodules.manifest import Manifest
 from datamodules.shards import read_shard, write_shard
 
 
@@ -100,6 +102,20 @@ def test_no_label_changes_a_prediction(tmp_path, root, trained, monkeypatch):
     assert sum(len(batch.part_id) for batch in before) == 16
     for left, right in zip(before, after, strict=True):
         _assert_same(left, right)
+
+
+@pytest.mark.parametrize(("state_range", "refused"), [(math.pi / 2, True), (math.radians(135), False)])
+def test_data_that_move_farther_than_the_model_are_refused(tmp_path, state_range, refused):
+    folder = write_synthetic_set(tmp_path)
+    manifest = Manifest.load(folder)
+    manifest.options["range_deg"] = [0, 135]
+    manifest.save(folder)
+    module = tiny_module(state_range=state_range)
+    if not refused:
+        fit(module, tmp_path, 1)
+        return
+    with pytest.raises(ValueError, match=r"by 135 degrees .*model by 90: train with --model\.state_range 2\.3562"):
+        fit(module, tmp_path, 1)
 
 
 def _loader(root):
