@@ -45,6 +45,7 @@ from articulate_ssl.training.running_statistics import RadiusStatistics
 from articulate_ssl.training.schedule import ScheduleOptions
 from articulate_ssl.training.set_clouds import SetClouds
 from articulate_ssl.training.test_report import TestReport
+from datamodules.articulated_data_module import ArticulatedDataModule
 from datamodules.articulated_dataset import split_labels
 from datamodules.manifest import Manifest
 
@@ -253,10 +254,12 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
 
     def on_train_start(self) -> None:
         """Refuse data that move farther than the model does; stage 0 starts from one of their clouds."""
-        _require_range(self.trainer.datamodule.manifest, self.hparams.state_range)
-        self.num_points = self.trainer.datamodule.hparams.num_points
+        data = self.trainer.datamodule
+        if isinstance(data, ArticulatedDataModule):  # benchmarks train on clouds of no set
+            _require_range(data.manifest, self.hparams.state_range)
+        self.num_points = data.hparams.num_points
         if self.rigid is not None and self.global_step == 0:
-            self.rigid.start_from(SetClouds(self.trainer.datamodule).clouds(1)[0].to(self.device))
+            self.rigid.start_from(SetClouds(data).clouds(1)[0].to(self.device))
 
     def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """One step of stage 0, or of the recipe; under autocast only the backbones run in low precision."""
