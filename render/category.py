@@ -14,7 +14,7 @@ from collections.abc import Mapping, Set
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import resources
-from math import radians
+from math import degrees, radians
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -147,7 +147,8 @@ class CategorySpec:
                 they are.
         """
         if not lower < upper:
-            raise ValueError(f"a hinge's states lie between two angles, the smaller one first, not {lower} and {upper}")
+            said = f"{degrees(lower):g} and {degrees(upper):g} degrees"
+            raise ValueError(f"a hinge's states lie between two angles, the smaller one first, not {said}")
         if not any(joint.type == REVOLUTE for joint in self.joints):
             raise ValueError(f"category {self.name!r} has no hinges of its own, whose states could be others")
         joints = [replace(j, lower=lower, upper=upper) if j.type == REVOLUTE else j for j in self.joints]

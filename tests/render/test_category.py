@@ -52,8 +52,8 @@ def test_hinges_may_be_asked_for_in_other_states_and_nothing_else_changes():
     closed = oven.with_hinges_within(0.0, pi / 4)
     assert (closed.joints[0].lower, closed.joints[0].upper, closed.joints[0].rest) == (0.0, pi / 4, 0.0)
     assert replace(closed, joints=oven.joints) == oven
-    with pytest.raises(ValueError, match="the smaller one first, not 1 and 1"):
-        oven.with_hinges_within(1, 1)
+    with pytest.raises(ValueError, match="the smaller one first, not 45 and 45 degrees"):
+        oven.with_hinges_within(pi / 4, pi / 4)
     for name in ("drawer", "articulated"):
         with pytest.raises(ValueError, match=f"'{name}' has no hinges of its own"):
             load_category(name).with_hinges_within(0, 1)

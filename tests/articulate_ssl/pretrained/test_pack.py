@@ -9,9 +9,10 @@ import yaml
 from packable import ROOT, made_up_metrics, write_run
 
 from articulate_ssl.inference.checkpoint_file import CheckpointError
-from articulate_ssl.pretrained.pack import fit_command, newest_metrics, pack, weaknesses
+from articulate_ssl.pretrained.pack import fit_command, generate_arguments, newest_metrics, pack, weaknesses
 from articulate_ssl.training.checkpoint import load_module
 from articulate_ssl.training.weights_card import WeightsCard
+from datamodules.manifest import MANIFEST_NAME, Manifest
 from render.generate import _parser
 
 
@@ -58,6 +59,14 @@ def test_the_command_for_the_data_is_one_that_the_generator_takes(run, tmp_path)
     options = _parser().parse_args(words)
     assert module == "render.generate" and options.seed == card.data["seed"] == 11
     assert (options.train_instances, options.test_instances, options.states) == (3, 2, 4)
+
+
+def test_the_command_for_data_says_what_states_of_hinges_they_have(original):
+    (file,) = original.glob(f"**/{MANIFEST_NAME}")
+    manifest = Manifest.load(file.parent)
+    assert not hasattr(_parser().parse_args(generate_arguments(manifest)), "range_deg")
+    manifest.options["range_deg"] = [0.0, 30.5]
+    assert _parser().parse_args(generate_arguments(manifest)).range_deg == [0, 30.5]
 
 
 def test_a_run_with_other_options_gets_no_card(run, tmp_path):
