@@ -152,7 +152,7 @@ class ScanPrediction:
         """About a scan that is unlike what the network was trained on, "this scan is ..."; empty if nothing is odd."""
         if self.unlike is None:
             return ""
-        odd = [f"explained with {joint}, which no training cloud had" for joint in self._joints_beyond()]
+        odd = [f"explained with {joint}, well outside what training showed" for joint in self._joints_beyond()]
         if self.unlike >= UNLIKE:
             odd.append(f"explained worse than {UNLIKE:.0%} of the training clouds")
         if not odd:

@@ -66,12 +66,12 @@ def test_states_that_do_not_fit_the_joints_are_refused(states):
     ("make", "limits", "said"),
     [  # the laptop's lid is at 1.2 radians, the drawers are .2, .1 and 0 out
         (synthetic.laptop, [0.0, 1.1], ""),
-        (synthetic.laptop, [0.0, 0.9], r"joint_0 at 69° \(of 0° to 52°\), which no training cloud had"),
+        (synthetic.laptop, [0.0, 0.9], r"joint_0 at 69° \(of 0° to 52°\), well outside what training showed"),
         (synthetic.laptop, [1.6, 2.6], r"joint_0 at 69° \(of 92° to 149°\)"),
         (
             synthetic.drawer,
             [0.0, 0.095],
-            r"with joint_0 at 0.08 \(of 0 to 0.038\), which no training cloud had: it may",
+            r"with joint_0 at 0.08 \(of 0 to 0.038\), well outside what training showed: it may",
         ),
     ],
 )
@@ -85,7 +85,7 @@ def test_joints_well_beyond_what_training_showed_are_warned_of(make, limits, sai
 
 def test_both_warnings_are_one_sentence():
     warning = result_of(synthetic.laptop, state_range=torch.tensor([[0.0, 0.9]]), unlike=0.995).warning
-    assert "which no training cloud had and explained worse than 99% of the training clouds: it may be" in warning
+    assert "well outside what training showed and explained worse than 99% of the training clouds: it may be" in warning
 
 
 def test_parts_and_joints_are_those_of_the_json():
