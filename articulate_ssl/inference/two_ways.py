@@ -51,6 +51,7 @@ FEWEST = 100  # clouds from which a decision is learnt
 _RIDGE = 0.3  # of discriminant analysis, in units of a standardised feature's variance
 _CAP = 3.0  # standard deviations, beyond which a feature counts as this far
 _COMPONENTS = (2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24)  # whitened principal directions, tried in turn
+_FLAT = 1e-6  # of the largest principal deviation: less is none
 _STARTS, _STEPS, _RATE = 64, 80, 0.15  # of the descent to least kurtosis
 _SEARCHES = 4  # in each of these numbers of directions, from other starts
 _ROUNDS, _STAYS = 500, 1e-3  # of expectation maximisation at most; and what no answer moves by in the end
@@ -144,9 +145,9 @@ class TwoWays(WithSurface):
         differences = differences[:, np.isfinite(differences).all(axis=(0, 2))]
         if differences.shape[1] < FEWEST:
             return False
-        standardised, _ = _standardised(differences[0])
+        standardised, _ = scaled_and_capped(differences[0])
         answers = np.sign(standardised @ decision_direction(standardised))
-        standardised, scale = _standardised(np.concatenate(list(differences)))
+        standardised, scale = scaled_and_capped(np.concatenate(list(differences)))
         weight = _discriminant(standardised, np.tile(answers, 2))
         self.scale.copy_(torch.from_numpy(scale))
         self.weight.copy_(torch.from_numpy(weight))
@@ -193,11 +194,12 @@ def expectation_maximised(
 
 
 def _starts(differences: np.ndarray) -> Iterator[np.ndarray]:
-    """Answers [n] of directions of least kurtosis."""
+    """Answers [n] of the direction of most variance, and of directions of least kurtosis."""
     generator = np.random.default_rng(0)
     _, size, directions = np.linalg.svd(differences, full_matrices=False)
+    yield np.sign(differences @ directions[0])
     for count in _COMPONENTS:
-        if count > min(differences.shape) // 2:
+        if count > min(differences.shape) // 2 or size[count - 1] <= _FLAT * size[0]:
             break
         white = differences @ (directions[:count].T / size[:count] * np.sqrt(len(differences)))
         for _ in range(_SEARCHES):
@@ -224,7 +226,7 @@ def _discriminant(differences: np.ndarray, sign: np.ndarray) -> np.ndarray:
     return 2 * np.linalg.solve(spread, mean)
 
 
-def _standardised(differences: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def scaled_and_capped(differences: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Differences [n, F] in units of their scale, capped, and that scale [F]."""
     scale = np.sqrt((differences**2).mean(axis=0)) + 1e-9
     return np.clip(differences / scale, -_CAP, _CAP), scale

@@ -5,13 +5,18 @@ of them, though of ovens one in nine lies on its side. What it disagrees with is
 it then stands more than nine in ten of the lying ovens up and turns over one in fifty others (docs/experiments.md,
 step 124). If all bodies seem to stand alike, it is taught anew by doors and their mirror images, once, and each lesson
 is doubted: three without doubt taught no more (step 130). In views of an upright camera nothing of that is needed.
+
+Where objects are hinged on either side as often, there are no most: half of them are predicted upside down, and lessons
+that believe that teach nothing. What doors have above they then have below as often, and which of them are the other
+way up they say themselves (`upside_down`); lessons begin with that. But a latch may be above or below as it comes, and
+say nothing of which side is up: so nothing is begun where bodies, in the mirror, too, stand as they are predicted.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,12 +28,12 @@ from articulate_ssl.inference.view_search import ViewSearch
 from articulate_ssl.ops.progress import announced, tell
 from articulate_ssl.training.explanations import registered_points, with_noise
 from articulate_ssl.training.surface_lessons import FEWEST, TAUGHT, Lessons, believable, teach
+from articulate_ssl.training.upside_down import upside_down
 
 if TYPE_CHECKING:
     from articulate_ssl.training.module import ArticulatedPoseModule
 
 _BATCH, _CHUNK = 16, 64
-_ROUNDS = 3  # of lessons about bodies
 _DOUBT = 0.06  # share of the lessons about doors that may be wrong. No other was tried.
 # Share of the first clouds in which enough is seen of the body, or the door, without which nothing is learnt. Chosen.
 _FIRST, _KNOWN = 64, 0.9
@@ -41,6 +46,34 @@ _RARE = 1e-3  # least share of a side
 _SHARES = 50  # rounds of expectation and maximisation
 
 log = logging.getLogger(__name__)
+
+
+class _Course(NamedTuple):
+    """How a network is taught which side is up: by what, how often anew, and what share of it may be wrong."""
+
+    seen: str
+    rounds: int
+    doubt: float
+
+
+_BODIES, _DOORS = _Course("bodies", 3, 0.0), _Course("doors", 1, _DOUBT)
+_MIRRORED_BODIES = _Course("bodies and their mirror images", 1, _DOUBT)
+_HALF_OF_THE_DOORS = _Course("doors, half of them upside down", 3, _DOUBT)
+
+
+class _Said(NamedTuple):
+    """What a network says of clouds that did not teach it: shares of what is to be turned, and of what is undecided."""
+
+    turned: float
+    undecided: float
+
+    @property
+    def decided(self) -> bool:
+        return self.undecided <= _MOST_UNDECIDED
+
+    @property
+    def useful(self) -> bool:
+        return self.decided and _LEAST_TURNED <= self.turned <= _MOST_TURNED
 
 
 @torch.no_grad()
@@ -73,18 +106,30 @@ def learn_hinge_sides(
         tell(log, "hinge sides: too little is seen behind the closed door")
         return
     predictions += _predictions(module, clouds[_FIRST:])
-    for doors in (False, True):
-        sides.surface = None
-        sides.doors.fill_(doors)
-        bodies = _bodies(module, clouds, predictions)
-        if not _seen_enough(bodies) or not _learnt(module, bodies):
-            continue
-        if doors:
-            sides.closed.zero_()  # what is upside down is a mirror image, whose door is as far from closed
+    bodies = _bodies(module, clouds, predictions)
+    if _seen_enough(bodies) and _taught(module, bodies, _BODIES).useful:
         sides.learnt.fill_(True)
         return
+    sides.doors.fill_(True)
+    doors = _bodies(module, clouds, predictions)
+    if _seen_enough(doors):
+        said = _taught(module, doors, _DOORS)
+        if said.useful or (not said.decided and _half_are_upside_down(module, clouds, predictions, doors)):
+            sides.closed.zero_()  # what is upside down is a mirror image, whose door is as far from closed
+            sides.learnt.fill_(True)
+            return
     sides.doors.fill_(False)
     sides.surface = None
+
+
+def _half_are_upside_down(
+    module: ArticulatedPoseModule, clouds: Tensor, predictions: Sequence[Prediction], doors: Bodies
+) -> bool:
+    """Whether doors say which of them are upside down, though none seems to be the right way up more often."""
+    bodies = _bodies(module, clouds, predictions, behind=True)
+    if not _seen_enough(bodies) or _taught(module, bodies, _MIRRORED_BODIES).decided:
+        return False
+    return _taught(module, doors, _HALF_OF_THE_DOORS, upside_down(doors)).decided
 
 
 def _seen_enough(bodies: Bodies) -> bool:
@@ -125,34 +170,40 @@ def _learn_from_views(sides: HingeSides, views: ViewSearch) -> None:
         sides.camera.forget()
 
 
-def _learnt(module: ArticulatedPoseModule, bodies: Bodies) -> bool:
-    """Whether lessons about what is seen tell some sides from most, and few are undecided."""
+def _taught(
+    module: ArticulatedPoseModule,
+    bodies: Bodies,
+    course: _Course,
+    ways: Tensor | None = None,  # [n] way in which each looks right, for the first lesson; None: as it is predicted
+) -> _Said:
+    """Teach a network what looks right, and ask it of the clouds that did not teach it."""
     sides = module.estimator.hinge_sides
     known = bodies.known.nonzero()[:, 0]
     order = known[torch.randperm(len(known), generator=torch.Generator().manual_seed(0)).to(known.device)]
     count = int(TAUGHT * len(order))
     taught, rest = bodies.rows(order[:count]), bodies.rows(order[count:])
-    every, ways = torch.arange(count, device=order.device)[:, None], torch.arange(len(sides.quarters)).to(order)
-    turned = torch.zeros_like(every)
-    seen, rounds, doubt = ("doors", 1, _DOUBT) if sides.doors else ("bodies", _ROUNDS, 0.0)
-    for lesson in range(1, rounds + 1):
-        frames = taught.frames[every, sides.quarters[(turned + ways) % len(ways)]]
-        lessons = Lessons(taught.points, taught.surface, frames, bool(sides.doors), doubt)
-        sides.surface = teach(lessons, f"which side is up, {lesson} of {rounds}", sides.size)
-        if lesson < rounds:
+    every, steps = torch.arange(count, device=order.device)[:, None], torch.arange(len(sides.quarters)).to(order)
+    halves = ways is not None
+    turned = ways[order[:count], None] if halves else torch.zeros_like(every)
+    for lesson in range(1, course.rounds + 1):
+        frames = taught.frames[every, sides.quarters[(turned + steps) % len(steps)]]
+        lessons = Lessons(taught.points, taught.surface, frames, bool(sides.doors), course.doubt)
+        sides.surface = teach(lessons, f"which side is up, {lesson} of {course.rounds}", sides.size)
+        if lesson < course.rounds:
             turned = _odds(module, taught).argmax(dim=1, keepdim=True)
     odds = _odds(module, rest)
     share = _shares(odds)
     believed = odds + share.log()
     best = believed.topk(2, dim=1).values
-    undecided, other = float((best[:, 0] - best[:, 1] < DECIDED).double().mean()), float(1 - share[0])
+    said = _Said(float(1 - share[0]), float((best[:, 0] - best[:, 1] < DECIDED).double().mean()))
     percent = (100 * share).round().int().tolist()
-    tell(log, "hinge sides, by %s: %s %% of the clouds, undecided %.0f %%", seen, percent, 100 * undecided)
+    tell(log, "hinge sides, by %s: %s %% of the clouds, undecided %.0f %%", course.seen, percent, 100 * said.undecided)
     sides.log_prior.zero_()
     sides.log_prior[: len(share)] = share.log()
-    # As surely as what is predicted is right, which most is.
-    sides.surface.temperature.copy_(believable(believed[:, 0] - believed[:, 1:].logsumexp(dim=1)))
-    return _LEAST_TURNED <= other <= _MOST_TURNED and undecided <= _MOST_UNDECIDED
+    if not halves:
+        # As surely as what is predicted is right, which most is.
+        sides.surface.temperature.copy_(believable(believed[:, 0] - believed[:, 1:].logsumexp(dim=1)))
+    return said
 
 
 def _predictions(module: ArticulatedPoseModule, clouds: Tensor) -> list[Prediction]:
@@ -164,14 +215,18 @@ def _predictions(module: ArticulatedPoseModule, clouds: Tensor) -> list[Predicti
     ]
 
 
-def _bodies(module: ArticulatedPoseModule, clouds: Tensor, predictions: Sequence[Prediction]) -> Bodies:
-    """What is seen of training clouds, as they are and with noise."""
+def _bodies(
+    module: ArticulatedPoseModule, clouds: Tensor, predictions: Sequence[Prediction], behind: bool = False
+) -> Bodies:
+    """What is seen of training clouds, as they are and with noise; `behind` the doors, though doors are seen."""
     sides, generator = module.estimator.hinge_sides, torch.Generator().manual_seed(0)
     shown = announced(log, "hinge sides, surfaces", clouds.split(_BATCH))
-    return Bodies.cat(
-        sides.bodies(prediction, some, (some, with_noise(some, generator)))
-        for some, prediction in zip(shown, predictions, strict=True)
-    )
+
+    def seen(one: Prediction, some: Tensor) -> Bodies:
+        versions = some, with_noise(some, generator)
+        return sides.bodies_at(one.base_pose, some, versions) if behind else sides.bodies(one, some, versions)
+
+    return Bodies.cat(seen(one, some) for some, one in zip(shown, predictions, strict=True))
 
 
 def _odds(module: ArticulatedPoseModule, bodies: Bodies) -> Tensor:

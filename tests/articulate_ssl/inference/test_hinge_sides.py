@@ -272,7 +272,7 @@ def _drawn(quarters: torch.Tensor, up: int = 1) -> Bodies:
 @pytest.mark.parametrize(("share", "learnt"), [(0.12, True), (0.0, False), (0.6, False)], ids=["some", "none", "most"])
 def test_some_that_lie_are_learnt(box_module, monkeypatch, share, learnt):
     quarters = torch.where(torch.rand(200, generator=torch.Generator().manual_seed(2)) < share, 3, 0)
-    monkeypatch.setattr(hinge_lessons, "_bodies", lambda _, clouds, __: _drawn(quarters[: len(clouds)]))
+    monkeypatch.setattr(hinge_lessons, "_bodies", lambda _, clouds, *__, **___: _drawn(quarters[: len(clouds)]))
     learn_hinge_sides(box_module, torch.zeros(200, POINTS, 3))
     sides = box_module.hinge_sides
     assert bool(sides.learnt) == learnt
@@ -348,7 +348,7 @@ def test_a_few_points_of_the_body_do_not_make_the_door_another():
 
 def test_nothing_is_learnt_where_too_little_is_seen(box_module, monkeypatch):
     unknown = _drawn(torch.zeros(64))._replace(known=torch.arange(64) < 50)
-    monkeypatch.setattr(hinge_lessons, "_bodies", lambda *_: unknown)
+    monkeypatch.setattr(hinge_lessons, "_bodies", lambda *_, **__: unknown)
     monkeypatch.setattr(hinge_lessons, "teach", None)
     learn_hinge_sides(box_module, torch.zeros(100, POINTS, 3))
     assert not box_module.hinge_sides.learnt
@@ -356,7 +356,7 @@ def test_nothing_is_learnt_where_too_little_is_seen(box_module, monkeypatch):
 
 def test_lessons_turn_what_the_network_disagrees_with(box_module, monkeypatch):
     quarters = torch.where(torch.rand(200, generator=torch.Generator().manual_seed(2)) < 0.12, 1, 0)
-    monkeypatch.setattr(hinge_lessons, "_bodies", lambda _, clouds, __: _drawn(quarters[: len(clouds)]))
+    monkeypatch.setattr(hinge_lessons, "_bodies", lambda _, clouds, *__, **___: _drawn(quarters[: len(clouds)]))
     given = []
     monkeypatch.setattr(hinge_lessons, "teach", lambda lessons, *_: given.append(lessons) or TopIsUp())
     learn_hinge_sides(box_module, torch.zeros(200, POINTS, 3))
@@ -373,7 +373,7 @@ def test_doors_are_shown_where_all_bodies_seem_to_stand_alike(box_module, monkey
     quarters = torch.where(torch.rand(200, generator=torch.Generator().manual_seed(2)) < 0.12, 2, 0)
     sides, given, up = box_module.hinge_sides, [], 0 if hidden else 1
 
-    def seen(_, clouds, __):
+    def seen(_, clouds, *__, **___):
         return _drawn(quarters[: len(clouds)] * (0 if hidden and not sides.doors else 1), up)
 
     monkeypatch.setattr(hinge_lessons, "_bodies", seen)
@@ -385,6 +385,41 @@ def test_doors_are_shown_where_all_bodies_seem_to_stand_alike(box_module, monkey
     assert [lessons.doubt > 0 for lessons in given] == [lessons.mirrored for lessons in given]
     assert (float(sides.closed) == 0) == hidden
     assert float(sides.log_prior.exp()[1 if hidden else 2]) == pytest.approx(0.12, abs=0.08)
+
+
+class Undecided(TopIsUp):
+    """Everything looks as right to it."""
+
+    def seen(self, cloud):
+        return 0 * super().seen(cloud)
+
+
+@pytest.mark.parametrize("mirrored", [False, True], ids=["bodies tell in the mirror", "bodies do not"])
+def test_where_half_are_upside_down_doors_say_which(box_module, monkeypatch, mirrored):
+    """Lessons that believe predictions teach nothing; those that begin with what doors say turn half of them."""
+    turned = torch.arange(200) % 2
+    sides, given = box_module.hinge_sides, []
+
+    def seen(_, clouds, *__, behind=False):
+        return _drawn(turned[: len(clouds)] * (2 if sides.doors and not behind else 0), 0)
+
+    def teach(lessons, *_):
+        given.append(lessons)
+        told = not lessons.mirrored or len(lessons.frames[:, 0].unique(dim=0)) > 1
+        return TopIsUp(0) if told or (len(given) == 5 and not mirrored) else Undecided(0)
+
+    monkeypatch.setattr(hinge_lessons, "_bodies", seen)
+    monkeypatch.setattr(hinge_lessons, "teach", teach)
+    monkeypatch.setattr(hinge_lessons, "upside_down", lambda doors: turned[: len(doors.known)])
+    learn_hinge_sides(box_module, torch.zeros(200, POINTS, 3))
+    assert bool(sides.learnt) == bool(sides.doors) == mirrored
+    # Bodies three times, doors, bodies in the mirror; then doors three times, half of them turned.
+    assert [lessons.mirrored for lessons in given] == [False] * 3 + [True] * (5 if mirrored else 2)
+    if mirrored:
+        assert float(sides.closed) == 0
+        assert sides.log_prior[:2].exp().tolist() == pytest.approx([0.5, 0.5], abs=0.1)
+    else:
+        assert sides.surface is None
 
 
 def test_it_is_part_of_the_weights_and_older_ones_have_none():

@@ -92,7 +92,7 @@ def test_of_two_differences_the_likelier_counts_and_not_the_one_of_least_kurtosi
     plain, common = np.where(torch.rand(2, count, generator=generator).numpy() < 0.5, -1.0, 1.0)
     values[:, 0] = 2 * plain + np.sign(values[:, 0]) * np.abs(values[:, 0]) ** 0.5
     values[:, 1:] += 0.5 * common[:, None]
-    values, _ = two_ways._standardised(values)
+    values, _ = two_ways.scaled_and_capped(values)
     ends = [expectation_maximised(values, sign) for sign in (plain, common)]
     kurtosis = [two_ways._kurtosis(values @ weight) for _, weight, _ in ends]
     assert ends[0][0] < ends[1][0] and kurtosis[0] < kurtosis[1]
