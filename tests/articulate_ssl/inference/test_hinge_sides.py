@@ -28,18 +28,35 @@ def test_faces_say_when_the_door_is_closed():
     shape = box_shape()
     tilt = roma.rotvec_to_rotmat(torch.tensor([0.0, 0.1, -0.1]))
     believed = replace(shape, joints=replace(shape.joints, axis=HINGE[None] @ tilt.mT))
-    frames = PartFrames(2)
-    frames.flat.fill_(True)
-    frames.measured.fill_(True)
-    frames.direction.copy_(HINGE)
-    frames.axes[0] = torch.eye(3)[:, [2, 0, 1]]
-    frames.axes[1] = roma.rotvec_to_rotmat(-ZERO * HINGE)
+    frames = _faces()
     sides, by_boxes = HingeSides(), HingeSides()
     sides.measure(believed, torch.tensor([[ZERO + 0.9, ZERO + 1.8]]), frames)
     by_boxes.measure(believed, torch.tensor([[ZERO + 0.9, ZERO + 1.8]]))
     assert abs(float(sides.closed) - ZERO) < 0.005
     assert abs(float(by_boxes.closed) - ZERO) > 0.005
     torch.testing.assert_close(sides.axes, torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]), atol=1e-5, rtol=0)
+
+
+def _faces() -> PartFrames:
+    """How the faces of box and door lie."""
+    frames = PartFrames(2)
+    frames.flat.fill_(True)
+    frames.measured.fill_(True)
+    frames.direction.copy_(HINGE)
+    frames.axes[0] = torch.eye(3)[:, [2, 0, 1]]
+    frames.axes[1] = roma.rotvec_to_rotmat(-ZERO * HINGE)
+    return frames
+
+
+@pytest.mark.parametrize("every", [3, 10])
+def test_a_door_that_holds_pieces_of_the_body_is_closed_where_it_is_near_it(every):
+    """Wide open, these pieces are where the body is, and the whole is smaller than with the door closed."""
+    shape = box_shape()
+    label = shape.label.clone()
+    label[((label == 0) & (shape.points[:, 1] > 0.25)).nonzero()[::every]] = 1  # beside the hinge
+    sides = HingeSides()
+    sides.measure(replace(shape, label=label), torch.tensor([[ZERO + 0.9, ZERO + 1.8]]), _faces())
+    assert float(sides.closed) == pytest.approx(ZERO, abs=0.01)
 
 
 def _posed(prediction: Prediction) -> torch.Tensor:
