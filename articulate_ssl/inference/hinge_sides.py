@@ -104,10 +104,10 @@ class HingeSides(WithSurface):
     Attributes:
         doors: [] whether doors are seen, also in the mirror, and not bodies.
         learnt: [] whether some objects are hinged elsewhere. Then joint states count from `closed`.
-        closed: [] joint state at which the door is closed, of predictions before; 0 once half turns alone are told, as
-            mirror images are closed by as much.
+        closed: [] joint state at which the door is closed, of predictions before; the middle of the states that were
+            seen once half turns alone are told, as mirror images are closed by as much.
         axes: [3, 3] columns: of the object's box in canonical space, the door's normal last, pointing at the body.
-        shut: [] joint state at which the door is closed, where states do not count from that.
+        shut: [] joint state at which the door is closed, as predictions count it when doors are seen.
         door: [3] canonical space, the middle of the closed door.
         log_prior: [TURNS] logarithm of the share of objects that are to be turned so; as many as there are ways count.
         surface: How right a body, or a door, looks.

@@ -115,7 +115,9 @@ def learn_hinge_sides(
     if _seen_enough(doors):
         said = _taught(module, doors, _DOORS)
         if said.useful or (not said.decided and _half_are_upside_down(module, clouds, predictions, doors)):
-            sides.closed.zero_()  # what is upside down is a mirror image, whose door is as far from closed
+            # What is upside down is a mirror image, whose door is as far from closed; and in the middle of its range.
+            sides.closed.copy_(module.states.known.mean())
+            sides.shut -= sides.closed
             sides.learnt.fill_(True)
             return
     sides.doors.fill_(False)
