@@ -159,8 +159,9 @@ class HingeSides(WithSurface):
             shape = _without_strays(shape, child)
             axes, own = object_axes(shape), _box_axes(shape, child)
         hinge, one, other = axes[:, 0], own[:, 1], axes[:, 1]
-        # A closed door is square to its body and near it, and the whole is small. By either alone a door that holds
-        # pieces of the body may be taken for closed where it is wide open (docs/experiments.md, step 271).
+        # A closed door is square to its body and near it, and the whole is small. By the latter alone a door that
+        # holds pieces of the body was taken for closed where it is wide open, by the former alone some doors are
+        # nearly as close there (docs/experiments.md, step 271).
         square = math.atan2(float(torch.linalg.cross(one, other) @ hinge), float(one @ other))
         states = [square + k * math.pi / 2 for k in range(-8, 9)]
         states = [state for state in states if abs(state - float(state_range.mean())) <= _CLOSED_REACH]

@@ -15,7 +15,7 @@ from articulate_ssl.inference.hinge_sides import Bodies
 from articulate_ssl.inference.two_ways import decision_direction, scaled_and_capped
 
 # Along the hinge and away from it. Of 2,000 doors of safes, half of them upside down, .85 are told by 6 x 4, .76 by
-# 4 x 3, .84 by 12 x 6 (docs/experiments.md, step 269).
+# 4 x 3, .84 by 12 x 6, all of them training clouds (docs/experiments.md, step 269).
 _CELLS = 6, 4
 _EDGE = 0.01  # share of the points beyond either end of the grid
 _OUTLYING = 0.05  # normalised units before or behind the door's middle, beyond which a point counts as this far
