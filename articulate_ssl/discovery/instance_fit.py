@@ -7,6 +7,7 @@ closed one, so there every cloud's object also stretches each part; what parts a
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import roma
@@ -14,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import se3
 from articulate_ssl.ops.chamfer import nearest_distance, nearest_squared_distance
 from articulate_ssl.shape.articulated_shape import MIN_POINTS, ArticulatedShape
@@ -40,6 +42,10 @@ _LAST_RATE = 0.02  # what is left of it in the last cycle
 _POINTS = 384  # of template and cloud, drawn anew for every step
 _CAP = 0.06  # distances beyond this count as this when points are given to parts
 _SMOOTHING = 16  # template points over which labels are smoothed
+# What turns has to explain a point better than what it is hinged on by so much, where it moves the point by the second
+# or farther; by less near its hinge, where nothing explains much better. Chosen on training clouds of ovens, safes and
+# laptops (docs/experiments.md, step 273).
+_CLEARER, _FAR = 0.006, 0.07
 
 
 class InstanceFit:
@@ -282,15 +288,41 @@ class InstanceFit:
 
     @torch.no_grad()
     def _relabel(self, clouds: Tensor, keep: float) -> None:
-        """Give every template point to the part whose motion brings it closest to the clouds."""
+        """Give every template point to the part whose motion brings it closest to the clouds.
+
+        Walls across a hinge's axis stay in their plane however they turn: a disk of a body's wall about the hinge is
+        explained as well by a door, which then holds it. So what turns has what it explains clearly better.
+        """
         error = self.error(clouds, queries=256)
         kept = error <= error.quantile(keep)
-        maps, points, cost = self.maps(), self._shape.points, []
-        for part in range(self._shape.num_parts):
-            moved = torch.einsum("nij,mj->nmi", maps.linear[kept, part], points) + maps.shift[kept, part, None]
-            cost.append(nearest_distance(moved, clouds[kept]).clamp(max=_CAP).sum(dim=0))
-        self._shape = replace(self._shape, label=smooth_labels(points, torch.stack(cost, dim=1)))
+        maps, points = self.maps(), self._shape.points
+        moved = [
+            torch.einsum("nij,mj->nmi", maps.linear[kept, part], points) + maps.shift[kept, part, None]
+            for part in range(self._shape.num_parts)
+        ]
+        cost = [nearest_distance(one, clouds[kept]).clamp(max=_CAP).mean(dim=0) for one in moved]
+        owed = clearer_by(moved, self._shape.joints)
+        self._shape = replace(self._shape, label=smooth_labels(points, torch.stack(cost, dim=1) + owed))
         self._measure_parts()
+
+
+def clearer_by(
+    moved: Sequence[Tensor],  # K times [n, T, 3]
+    joints: Joints,
+) -> Tensor:  # [T, K]
+    """By how much closer each part must bring points than the root does, to have them.
+
+    Nothing of what slides: walls along the slide, which stay in their plane, too, are as often its own.
+
+    Args:
+        moved: Points, moved into n clouds as if all were of one part.
+    """
+    owed = torch.zeros(moved[0].shape[1], len(moved)).to(moved[0])
+    if joints.joint_type == REVOLUTE:
+        for parent, child in zip(joints.chain.parent, joints.chain.child, strict=True):
+            apart = (moved[child] - moved[parent]).norm(dim=-1).mean(dim=0)
+            owed[:, child] = owed[:, parent] + _CLEARER * (apart / _FAR).clamp(max=1).square()
+    return owed
 
 
 def smooth_labels(
