@@ -5,9 +5,10 @@ from dataclasses import replace
 import pytest
 import roma
 import torch
-from articulated_objects import DRAWER, GLASSES, LAPTOP, clouds, true_shape
+from articulated_objects import DRAWER, GLASSES, LAPTOP, OVEN, clouds, true_shape
 
-from articulate_ssl.discovery.instance_fit import InstanceFit
+from articulate_ssl.discovery import instance_fit
+from articulate_ssl.discovery.instance_fit import InstanceFit, clearer_by
 from articulate_ssl.geometry.screw import REVOLUTE, screw_motion
 from articulate_ssl.geometry.se3 import se3, transform_points
 
@@ -62,6 +63,45 @@ def test_labels_are_found_from_a_coarse_start():
     before = (wrong == data.part).float().mean()
     fit.optimise(data.points, 12)
     assert (fit.shape.label == data.part).float().mean() > 0.5 * (1 + before)
+
+
+def _disks_of_a_door(clearer: float, monkeypatch) -> float:
+    """Share that a door keeps of the disks of the body's walls, about the hinge, that it starts with."""
+    monkeypatch.setattr(instance_fit, "_CLEARER", clearer)
+    data = clouds(OVEN, count=16, points=1024, resample=True, proportions=0.1)
+    fit = _fit(OVEN, data)
+    opened = screw_motion(data.axis, data.pivot, torch.tensor([1.0]), REVOLUTE)
+    rest = torch.where(data.part[:, None] == 1, transform_points(opened[0], data.rest), data.rest)
+    height = data.rest[:, 1]
+    from_hinge = (data.rest - data.pivot[0])[:, [0, 2]].norm(dim=1)
+    disks = (data.part == 0) & ((height == 0) | (height == height.max())) & (from_hinge < 0.3)
+    assert disks.sum() > 40
+    shape = replace(fit.shape, points=rest, label=data.part | disks)
+    fit = InstanceFit(shape, data.base, data.state - 1, torch.Generator().manual_seed(1))
+    fit.optimise(data.points, 6)
+    assert (fit.shape.label == data.part)[~disks].float().mean() > 0.95
+    return float(fit.shape.label[disks].float().mean())
+
+
+def test_walls_that_turn_in_their_own_plane_are_of_what_stands_still(monkeypatch):
+    kept, where_either_may_have_them = (_disks_of_a_door(owed, monkeypatch) for owed in (instance_fit._CLEARER, 0.0))
+    assert kept < 0.5 * where_either_may_have_them  # .10 and .31 seen
+
+
+def test_what_hinges_carry_owes_more_the_farther_they_move_it():
+    data = clouds(GLASSES)
+    fit = _fit(GLASSES, data)
+    rest = torch.stack([data.pivot[0], data.pivot[0] + torch.tensor([0.5, 0, 0]), data.pivot[0] + torch.eye(3)[2]])
+    pose = fit.shape.joints.part_pose(data.base, data.state)
+    moved = [transform_points(pose[:, part], rest.expand(len(pose), -1, -1)) for part in range(3)]
+    owed = clearer_by(moved, fit.shape.joints)
+    assert (owed[:, 0] == 0).all()  # frame
+    on_hinge, far, on_axis = owed[:, 1]
+    torch.testing.assert_close(torch.stack([on_hinge, on_axis]), torch.zeros(2), atol=1e-6, rtol=0)
+    assert far == pytest.approx(instance_fit._CLEARER)
+    assert (owed[:, 2] == instance_fit._CLEARER).all()  # far from the other temple's hinge
+    slides = clearer_by(moved[:2], _fit(DRAWER, clouds(DRAWER)).shape.joints)
+    assert (slides == 0).all()  # walls along a slide are as often of what slides
 
 
 def test_a_stretched_part_stays_on_its_hinge():
