@@ -152,27 +152,8 @@ class HingeSides(WithSurface):
             frames: How the faces of its parts lie; where that is known, they are squarer than boxes about points.
         """
         root, child = shape.joints.chain.root, shape.joints.chain.child[0]
-        if frames is not None and frames.flat.all() and frames.measured.all():
-            shape = replace(shape, joints=replace(shape.joints, axis=frames.direction))
-            axes, own = frames.about_joint(root), frames.about_joint(child)
-        else:
-            shape = _without_strays(shape, child)
-            axes, own = object_axes(shape), _box_axes(shape, child)
-        hinge, one, other = axes[:, 0], own[:, 1], axes[:, 1]
-        # A closed door is square to its body and near it, and the whole is small. By the latter alone a door that
-        # holds pieces of the body was taken for closed where it is wide open, by the former alone some doors are
-        # nearly as close there (docs/experiments.md, step 271).
-        square = math.atan2(float(torch.linalg.cross(one, other) @ hinge), float(one @ other))
-        states = [square + k * math.pi / 2 for k in range(-8, 9)]
-        states = [state for state in states if abs(state - float(state_range.mean())) <= _CLOSED_REACH]
-
-        def open_by(state: float) -> float:
-            body, door = shape.part(root), _at(shape, child, state)
-            apart = float(torch.cdist(door, body).amin(dim=1).median())
-            whole = torch.cat([body, door]).double().cpu().numpy()
-            return apart * ConvexHull(whole, qhull_options="QJ").volume  # of flat ones, too
-
-        closed = min(states, key=open_by)
+        shape, axes, own = _boxes(shape, frames)
+        closed, hinge = _closed_state(shape, axes, own, state_range), axes[:, 0]
         door = _at(shape, child, closed)
         middle = (door.amax(dim=0) + door.amin(dim=0)) / 2
         extent = (door @ axes).amax(dim=0) - (door @ axes).amin(dim=0)
@@ -366,6 +347,44 @@ def _plane(
     middle = (dense * weight).sum(dim=1, keepdim=True)
     away = dense - middle
     return middle, torch.linalg.eigh((away * weight).mT @ away)[1][..., 0]
+
+
+def closed_state(shape: ArticulatedShape, state_range: Tensor, frames: PartFrames | None = None) -> float:
+    """The joint state at which the door of a category's shape is closed; arguments as of `HingeSides.measure`."""
+    return _closed_state(*_boxes(shape, frames), state_range)
+
+
+def _boxes(
+    shape: ArticulatedShape, frames: PartFrames | None
+) -> tuple[ArticulatedShape, Tensor, Tensor]:  # , [3, 3], [3, 3]
+    """The shape, as far as it counts, and columns: axes of its body and of its door, the hinge first."""
+    root, child = shape.joints.chain.root, shape.joints.chain.child[0]
+    if frames is not None and frames.flat.all() and frames.measured.all():
+        shape = replace(shape, joints=replace(shape.joints, axis=frames.direction))
+        return shape, frames.about_joint(root), frames.about_joint(child)
+    shape = _without_strays(shape, child)
+    return shape, object_axes(shape), _box_axes(shape, child)
+
+
+def _closed_state(shape: ArticulatedShape, axes: Tensor, own: Tensor, state_range: Tensor) -> float:
+    """A closed door is square to its body and near it, and the whole is small.
+
+    By the latter alone a door that holds pieces of the body was taken for closed where it is wide open, by the former
+    alone some doors are nearly as close there (docs/experiments.md, step 271).
+    """
+    root, child = shape.joints.chain.root, shape.joints.chain.child[0]
+    hinge, one, other = axes[:, 0], own[:, 1], axes[:, 1]
+    square = math.atan2(float(torch.linalg.cross(one, other) @ hinge), float(one @ other))
+    states = [square + k * math.pi / 2 for k in range(-8, 9)]
+    states = [state for state in states if abs(state - float(state_range.mean())) <= _CLOSED_REACH]
+
+    def open_by(state: float) -> float:
+        body, door = shape.part(root), _at(shape, child, state)
+        apart = float(torch.cdist(door, body).amin(dim=1).median())
+        whole = torch.cat([body, door]).double().cpu().numpy()
+        return apart * ConvexHull(whole, qhull_options="QJ").volume  # of flat ones, too
+
+    return min(states, key=open_by)
 
 
 def _without_strays(shape: ArticulatedShape, part: int) -> ArticulatedShape:

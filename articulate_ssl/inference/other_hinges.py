@@ -7,10 +7,9 @@ are right then (docs/experiments.md, step 246). So both are always sought.
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
-from articulate_ssl.inference.candidates import ANOTHER_WAY, angle_to
+from articulate_ssl.inference.contest import Contest
 from articulate_ssl.inference.final_fit import FinalFit
 from articulate_ssl.inference.upright_camera import UprightCamera
 from articulate_ssl.inference.votes import Votes
@@ -42,14 +41,11 @@ class OtherHinges:
         points: Tensor,  # [B, N, 3]
         dense: Tensor | None,  # [B, P, 3]
     ) -> tuple[Hypotheses, Hypotheses, Tensor, Votes | None]:  # H = 1, H = 1, [B]
-        """Explanations, or what views of either kind say by themselves, where that fits better.
-
-        What gives way is a rival, if it is turned another way, and the margin how much worse it fits, at most.
-        """
+        """Explanations, or what views of either kind say by themselves, where that fits better (`contest`)."""
         final, views = self.final, self.final.view_search
         if not self.known:
             return one, rival, margin, votes
-        error = final.distance(one, points)
+        contest = Contest(one, rival, margin, final.distance(one, points))
         for lying in (False, True):
             shown = ((views.quarters > 0) == lying).nonzero()[:, 0]
             if not len(shown):
@@ -58,17 +54,8 @@ class OtherHinges:
             start = final.articulated.category_at(seen.base[:, :1], seen.state[:, :1])
             tried, _ = final.registration.registered(start, points)
             tried = final.in_proportion(tried, points, dense)
-            tried_error = final.distance(tried, points)
-            rotation = tried.base[:, 0, :3, :3]
             likely = final.registration.states.contains(tried.state[:, 0])
-            likely &= (self.camera.stood(rotation)[1] > 0) == lying
-            fits = likely & (tried_error < error)
-            turned = likely & (angle_to(one.base[..., :3, :3], rotation)[:, 0] > ANOTHER_WAY)
-            beaten = 1 - error.minimum(tried_error) / error.maximum(tried_error)
-            before, after = (turned & fits).nonzero()[:, 0], (turned & ~fits & (beaten < margin)).nonzero()[:, 0]
-            rival = rival.with_rows(before, one.rows(before)).with_rows(after, tried.rows(after))
-            margin = torch.where(turned & (fits | (beaten < margin)), beaten, margin)
-            rows = fits.nonzero()[:, 0]
-            one, error = one.with_rows(rows, tried.rows(rows)), error.index_copy(0, rows, tried_error[rows])
+            likely &= (self.camera.stood(tried.base[:, 0, :3, :3])[1] > 0) == lying
+            contest, rows = contest.against(tried, final.distance(tried, points), likely)
             votes = votes._replace(share=votes.share.index_copy(0, rows, seen.votes.share[rows]))
-        return one, rival, margin, votes
+        return contest.one, contest.rival, contest.margin, votes

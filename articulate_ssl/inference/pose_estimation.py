@@ -6,7 +6,8 @@
    their joints, and the best reconstruction wins. What is decided for in the end takes the cloud's own proportions
    (`proportions`), turned as its parts' faces say (`part_frames`), with the shape that clouds of the collection have
    in common (`common_shape`), after which faces are looked at again; and if its joints are then beyond their limits,
-   it gives way to what is within them (`final_fit`).
+   it gives way to what is within them (`final_fit`). Boxes whose doors are as training showed none, or that another
+   explanation fits about as well, are sought again, square to their faces (`square_search`).
    Where parts slide, clouds of other objects that are most like it decide which way round it is; where these are
    labelled, they say which parts points are of, and where the category's shape is (`sliding_search`).
    Where simulated views taught, those that a view is most like decide which way round it is, and say with the
@@ -58,6 +59,7 @@ from articulate_ssl.inference.prediction import Prediction
 from articulate_ssl.inference.proposals import Proposals
 from articulate_ssl.inference.relief import NUM_FEATURES
 from articulate_ssl.inference.sliding_search import SlidingSearch
+from articulate_ssl.inference.square_search import SquareSearch
 from articulate_ssl.inference.state_range import StateRange
 from articulate_ssl.inference.two_ways import TwoWays
 from articulate_ssl.inference.view_search import ViewSearch
@@ -132,6 +134,7 @@ class PoseEstimator(Proposals):
             inference.proportions,
         )
         self.other_hinges = OtherHinges(self.final, self.hinge_sides.camera)
+        self.square_search = SquareSearch(self.final)
 
     @property
     def reads_dense(self) -> bool:
@@ -232,11 +235,13 @@ class PoseEstimator(Proposals):
         """
         with torch.autocast(points.device.type, enabled=False):
             registers = (self.inference.refine if refine is None else refine) is not False
+            self.square_search.measure()
             chosen, other, margin, votes = self._chosen(points, num_points, registers, dense)
             before = None
             if registers and fits:
                 before = self.final.distance(chosen, points)
                 chosen, other, margin = self.final.within_limits(chosen, other, margin, points, dense)
+                chosen, other, margin = self.square_search.sought(chosen, other, margin, points, dense)
                 chosen, other, margin, votes = self.other_hinges.sought(chosen, other, margin, votes, points, dense)
                 if self.view_search.parts is not None and self.object_frame.learnt and dense is not None:
                     turn = (chosen.base[:, 0, :3, :3] @ self.object_frame.axes).mT

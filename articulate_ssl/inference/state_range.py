@@ -16,15 +16,19 @@ class StateRange(nn.Module):
     Attributes:
         limits: [J, 2] running means of the lowest and of the highest of each batch: narrower than all states seen.
         seen: [J, 2] lowest and highest of what is predicted of training clouds in the end; equal until they are learnt.
+        rest: [J] the state of a closed door, which any may be in whether training showed it or not; NaN if not known.
     """
 
     def __init__(self, num_joints: int) -> None:
         super().__init__()
         self.register_buffer("limits", torch.zeros(num_joints, 2))
         self.register_buffer("seen", torch.zeros(num_joints, 2))
+        self.register_buffer("rest", torch.full((num_joints,), torch.nan))
 
     def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
-        state_dict.setdefault(f"{prefix}seen", torch.zeros_like(self.seen))  # weights from before they were learnt
+        # Weights from before they were learnt.
+        state_dict.setdefault(f"{prefix}seen", torch.zeros_like(self.seen))
+        state_dict.setdefault(f"{prefix}rest", torch.full_like(self.rest, torch.nan))
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     @property
@@ -37,9 +41,16 @@ class StateRange(nn.Module):
         """Lowest and highest state, as well as they are known."""
         return self.seen if self.learnt else self.limits
 
+    @property
+    def possible(self) -> Tensor:  # [J, 2]
+        """What is known, and on to a closed door."""
+        low, high = self.known.unbind(-1)
+        return torch.stack([torch.fmin(low, self.rest), torch.fmax(high, self.rest)], dim=-1)
+
     def forget(self) -> None:
         """As before they were learnt."""
         self.seen.zero_()
+        self.rest.fill_(torch.nan)
 
     def learn(
         self,
@@ -61,16 +72,25 @@ class StateRange(nn.Module):
         state: Tensor,  # [..., J]
         slack: float = _SLACK,
     ) -> Tensor:  # [...] bool
-        """Whether all joints are within what is known, or about; everything, until it is.
+        """Whether all joints are within what is possible, or about; everything, until it is known.
 
         Args:
-            slack: How far beyond it counts, of the width of a joint's range.
+            slack: How far beyond it counts, of the width of a joint's range as seen.
         """
+        return self._within(self.possible, state, slack)
+
+    def showed(
+        self,
+        state: Tensor,  # [..., J]
+    ) -> Tensor:  # [...] bool
+        """Whether training clouds showed it, or about; everything, until it is known."""
+        return self._within(self.seen, state, _SLACK)
+
+    def _within(self, limits: Tensor, state: Tensor, slack: float) -> Tensor:
         if not self.learnt:
             return torch.ones_like(state[..., 0], dtype=torch.bool)
-        low, high = self.seen.unbind(-1)
-        more = slack * (high - low)
-        return ((state >= low - more) & (state <= high + more)).all(dim=-1)
+        more = slack * (self.seen[:, 1] - self.seen[:, 0])
+        return ((state >= limits[:, 0] - more) & (state <= limits[:, 1] + more)).all(dim=-1)
 
     def starts(self) -> Tensor:  # [1 + 2^J, J]
         """Where to start looking for joint states: the middle of the range, and in every combination either side."""

@@ -37,9 +37,27 @@ def test_limits_are_where_most_states_are_in_a_range_as_wide_as_the_category_say
     assert not states.learnt
 
 
+def test_a_closed_door_is_possible_though_none_was_seen():
+    states = StateRange(1)
+    states.learn(torch.linspace(1, 2, 50)[:, None], 1.0)
+    state = torch.tensor([[0.1], [0.5], [1.5], [2.5]])
+    assert states.contains(state).tolist() == states.showed(state).tolist() == [False, False, True, False]
+    states.rest.fill_(0.1)
+    assert states.contains(state).tolist() == [True, True, True, False]
+    assert states.showed(state).tolist() == [False, False, True, False]
+    states.rest.fill_(2.5)  # at the other end
+    assert states.contains(state).tolist() == [False, False, True, True]
+    again = StateRange(1)
+    again.load_state_dict(states.state_dict())
+    assert torch.equal(again.possible, states.possible)
+    states.forget()
+    assert states.rest.isnan().all()
+
+
 def test_weights_from_before_they_were_learnt_know_no_limits():
     states = StateRange(1)
     states.learn(torch.linspace(0, 1, 50)[:, None], 1.0)
     older = {"limits": torch.tensor([[1.0, 2.0]])}
     states.load_state_dict(older)
     assert not states.learnt and torch.equal(states.known, older["limits"])
+    assert states.rest.isnan().all() and torch.equal(states.possible, states.known)
