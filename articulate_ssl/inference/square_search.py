@@ -61,9 +61,9 @@ class SquareSearch:
     def measure(self) -> None:
         """Find out at which joint state the door is closed, unless that is known."""
         states, final = self.final.registration.states, self.final
-        if self.known and states.rest.isnan().any():
+        if self.known and not states.rests:
             shape = final.articulated.category.articulated_shape(REVOLUTE)
-            states.rest.fill_(closed_state(shape, states.known, final.part_frames))
+            states.set_rest(closed_state(shape, states.known, final.part_frames))
 
     def sought(
         self,

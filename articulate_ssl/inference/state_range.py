@@ -16,19 +16,22 @@ class StateRange(nn.Module):
     Attributes:
         limits: [J, 2] running means of the lowest and of the highest of each batch: narrower than all states seen.
         seen: [J, 2] lowest and highest of what is predicted of training clouds in the end; equal until they are learnt.
-        rest: [J] the state of a closed door, which any may be in whether training showed it or not; NaN if not known.
+        rest: [J] the state of a closed door, which any may be in whether training showed it or not.
+        rests: [] whether it is known.
     """
 
     def __init__(self, num_joints: int) -> None:
         super().__init__()
         self.register_buffer("limits", torch.zeros(num_joints, 2))
         self.register_buffer("seen", torch.zeros(num_joints, 2))
-        self.register_buffer("rest", torch.full((num_joints,), torch.nan))
+        self.register_buffer("rest", torch.zeros(num_joints))
+        self.register_buffer("rests", torch.tensor(False))
 
     def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
         # Weights from before they were learnt.
         state_dict.setdefault(f"{prefix}seen", torch.zeros_like(self.seen))
-        state_dict.setdefault(f"{prefix}rest", torch.full_like(self.rest, torch.nan))
+        state_dict.setdefault(f"{prefix}rest", torch.zeros_like(self.rest))
+        state_dict.setdefault(f"{prefix}rests", torch.zeros_like(self.rests))
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     @property
@@ -44,13 +47,20 @@ class StateRange(nn.Module):
     @property
     def possible(self) -> Tensor:  # [J, 2]
         """What is known, and on to a closed door."""
+        if not self.rests:
+            return self.known
         low, high = self.known.unbind(-1)
-        return torch.stack([torch.fmin(low, self.rest), torch.fmax(high, self.rest)], dim=-1)
+        return torch.stack([low.minimum(self.rest), high.maximum(self.rest)], dim=-1)
 
     def forget(self) -> None:
         """As before they were learnt."""
         self.seen.zero_()
-        self.rest.fill_(torch.nan)
+        self.rests.fill_(False)
+
+    def set_rest(self, state: float) -> None:
+        """Take over at which state a door is closed."""
+        self.rest.fill_(state)
+        self.rests.fill_(True)
 
     def learn(
         self,

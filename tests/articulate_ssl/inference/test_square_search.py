@@ -61,11 +61,11 @@ def _off(one, data):
 
 def test_it_is_measured_where_a_door_is_closed(search):
     states = search.final.registration.states
-    assert states.rest.isnan().all() and torch.equal(states.possible, states.seen)
+    assert not states.rests and torch.equal(states.possible, states.seen)
     search.measure()
     assert float(states.rest) == pytest.approx(0, abs=0.1)
     torch.testing.assert_close(states.possible, torch.stack([states.rest, states.seen[:, 1]], dim=1))
-    states.rest.fill_(0.5)
+    states.set_rest(0.5)
     search.measure()  # once is enough
     assert float(states.rest) == 0.5
 
@@ -120,7 +120,7 @@ def test_elsewhere_nothing_is_sought(search, data, where):
     if where == "not faces":
         final.part_frames.flat[1] = False
     search.measure()
-    assert final.registration.states.rest.isnan().all() == (where != "no dense points")
+    assert bool(final.registration.states.rests) == (where == "no dense points")
     wrong = _at(search, *_turned(data))
     dense = None if where == "no dense points" else data.points
     one, rival, margin = search.sought(wrong, wrong, torch.zeros(4), data.points, dense)

@@ -42,16 +42,16 @@ def test_a_closed_door_is_possible_though_none_was_seen():
     states.learn(torch.linspace(1, 2, 50)[:, None], 1.0)
     state = torch.tensor([[0.1], [0.5], [1.5], [2.5]])
     assert states.contains(state).tolist() == states.showed(state).tolist() == [False, False, True, False]
-    states.rest.fill_(0.1)
+    states.set_rest(0.1)
     assert states.contains(state).tolist() == [True, True, True, False]
     assert states.showed(state).tolist() == [False, False, True, False]
-    states.rest.fill_(2.5)  # at the other end
+    states.set_rest(2.5)  # at the other end
     assert states.contains(state).tolist() == [False, False, True, True]
     again = StateRange(1)
     again.load_state_dict(states.state_dict())
     assert torch.equal(again.possible, states.possible)
     states.forget()
-    assert states.rest.isnan().all()
+    assert not states.rests
 
 
 def test_weights_from_before_they_were_learnt_know_no_limits():
@@ -60,4 +60,4 @@ def test_weights_from_before_they_were_learnt_know_no_limits():
     older = {"limits": torch.tensor([[1.0, 2.0]])}
     states.load_state_dict(older)
     assert not states.learnt and torch.equal(states.known, older["limits"])
-    assert states.rest.isnan().all() and torch.equal(states.possible, states.known)
+    assert not states.rests and torch.equal(states.possible, states.known)
