@@ -116,7 +116,7 @@ def _rounds(found: RegisteredShape, clouds: Tensor, few: Tensor, registrar: Regi
         _announce(2 * options.references + 1 + step, options, f"round {step + 1} of {options.rounds}")
         kept = found.error.argsort()[: options.kept(len(few))]
         fit = found.fit(registrar.generator, kept)
-        fit.optimise(few[kept], options.cycles, keep=options.keep)
+        fit.optimise(few[kept], options.cycles, keep=options.keep, owing=True)
         if fit.shape.smallest_share < options.min_share:
             log.warning("round %d lost a part; keeping the parts of the round before", step + 1)
             break

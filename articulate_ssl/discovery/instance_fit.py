@@ -148,6 +148,7 @@ class InstanceFit:
         bidirectional: bool = True,
         touching: bool = False,
         known: tuple[Tensor, Tensor] | None = None,
+        owing: bool = False,
     ) -> None:
         """Descend for `cycles` times `steps` steps; with `shared`, also joint lines, and labels after every cycle.
 
@@ -156,6 +157,7 @@ class InstanceFit:
             bidirectional: The clouds show all sides, so that each of the template's points must be near them, too.
             touching: Both parts of a joint are drawn to its line, as by the paper's joint regularization.
             known: [n] bool, whether clouds stay turned as they are, and [n, J] bool, whether joint states stay.
+            owing: What turns has what it explains clearly better (`clearer_by`), not what it explains as well.
         """
         own = [self._state, self._turn, self._shift, self._stretch]
         # In a frame that clouds have in common, what slides slides along one of its axes, exactly.
@@ -183,7 +185,7 @@ class InstanceFit:
                 optimizer.step()
                 self._state.data = self._shape.joints.clamped(self._state.data)
             if shared:
-                self._relabel(clouds, keep)
+                self._relabel(clouds, keep, owing)
         for parameter in parameters:
             parameter.requires_grad_(False)
 
@@ -287,12 +289,8 @@ class InstanceFit:
                 self._center = points.mean(dim=0)
 
     @torch.no_grad()
-    def _relabel(self, clouds: Tensor, keep: float) -> None:
-        """Give every template point to the part whose motion brings it closest to the clouds.
-
-        Walls across a hinge's axis stay in their plane however they turn: a disk of a body's wall about the hinge is
-        explained as well by a door, which then holds it. So what turns has what it explains clearly better.
-        """
+    def _relabel(self, clouds: Tensor, keep: float, owing: bool) -> None:
+        """Give every template point to the part whose motion brings it closest to the clouds."""
         error = self.error(clouds, queries=256)
         kept = error <= error.quantile(keep)
         maps, points = self.maps(), self._shape.points
@@ -301,8 +299,9 @@ class InstanceFit:
             for part in range(self._shape.num_parts)
         ]
         cost = [nearest_distance(one, clouds[kept]).clamp(max=_CAP).mean(dim=0) for one in moved]
-        owed = clearer_by(moved, self._shape.joints)
-        self._shape = replace(self._shape, label=smooth_labels(points, torch.stack(cost, dim=1) + owed))
+        cost = torch.stack(cost, dim=1)
+        cost = cost + clearer_by(moved, self._shape.joints) if owing else cost
+        self._shape = replace(self._shape, label=smooth_labels(points, cost))
         self._measure_parts()
 
 
@@ -311,6 +310,9 @@ def clearer_by(
     joints: Joints,
 ) -> Tensor:  # [T, K]
     """By how much closer each part must bring points than the root does, to have them.
+
+    Walls across a hinge's axis stay in their plane however they turn: a disk of a body's wall about the hinge is
+    explained as well by a door, which then holds it (docs/experiments.md, step 273).
 
     Nothing of what slides: walls along the slide, which stay in their plane, too, are as often its own.
 
