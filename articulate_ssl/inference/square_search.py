@@ -91,10 +91,7 @@ class SquareSearch:
         own, seen, least = points[rows], dense[rows], torch.where(showed[rows], _CLEARLY, 1.0)
         base, state = base[rows], state[rows]
         start = one.rows(rows), rival.rows(rows), margin[rows]
-        # Rivals have the category's own shape, not that which clouds have in common.
-        contest = Contest(
-            *start, final.distance(start[0], own), lambda one: final.articulated.category_at(one.base, one.state)
-        )
+        contest = Contest(*start, final.distance(start[0], own), self._as_rival)
         for k in range(min(_TRIED, base.shape[1])):
             tried = final.articulated.category_at(base[:, k : k + 1], state[:, k : k + 1])
             tried = final.in_proportion(tried, own, seen)
@@ -147,7 +144,8 @@ class SquareSearch:
         )
         base, state, error = (value.unflatten(0, sizes) for value in found)
         error = error / ratio.mean(dim=-1)  # as large as in the cloud
-        cloud, turn = torch.arange(len(points))[:, None], torch.arange(len(rotations))
+        cloud, turn = (torch.arange(count, device=points.device) for count in sizes[:2])
+        cloud = cloud[:, None]
         best = error.argmin(dim=2)
         base, state, error, ratio = (value[cloud, turn, best] for value in (base, state, error, ratio))
         shift = base[..., :3, 3] / ratio + middle[:, None]
