@@ -6,8 +6,8 @@
    their joints, and the best reconstruction wins. What is decided for in the end takes the cloud's own proportions
    (`proportions`), turned as its parts' faces say (`part_frames`), with the shape that clouds of the collection have
    in common (`common_shape`), after which faces are looked at again; and if its joints are then beyond their limits,
-   it gives way to what is within them (`final_fit`). Boxes whose doors are as training showed none, or that another
-   explanation fits about as well, are sought again, square to their faces (`square_search`).
+   it gives way to what is within them (`final_fit`). Boxes with doors are sought square to their faces, too, with
+   doors as far as closed (`square_search`).
    Where parts slide, clouds of other objects that are most like it decide which way round it is; where these are
    labelled, they say which parts points are of, and where the category's shape is (`sliding_search`).
    Where simulated views taught, those that a view is most like decide which way round it is, and say with the

@@ -8,21 +8,15 @@ import pytest
 import torch
 from articulated_objects import OVEN, clouds, true_shape
 from tiny import POINTS, tiny_module
-from true_category import Category
+from true_category import final_fit
 
 from articulate_ssl.geometry.screw import PRISMATIC
 from articulate_ssl.inference.candidates import Candidates
-from articulate_ssl.inference.common_shape import CommonShape
 from articulate_ssl.inference.final_fit import FinalFit
-from articulate_ssl.inference.hypothesis_registration import HypothesisRegistration
-from articulate_ssl.inference.object_frame import ObjectFrame
 from articulate_ssl.inference.options import InferenceOptions
-from articulate_ssl.inference.part_frames import PartFrames
 from articulate_ssl.inference.proportions import Descent, fit_proportions
 from articulate_ssl.inference.state_range import StateRange
-from articulate_ssl.inference.view_search import ViewSearch
 from articulate_ssl.network.hypotheses import Hypotheses
-from articulate_ssl.shape.observation import Observation
 
 
 @pytest.fixture
@@ -32,16 +26,9 @@ def data():
 
 @pytest.fixture
 def final(data) -> FinalFit:
-    shape = true_shape(OVEN, data)
-    order = shape.label.argsort(stable=True)
     states = StateRange(1)
     states.limits.copy_(torch.tensor([[0.4, 1.6]]))
-    options = InferenceOptions(refine=True, proportions=6)
-    registration = HypothesisRegistration(options, Observation(), states)
-    network = Category(replace(shape, points=shape.points[order], label=shape.label[order]))
-    return FinalFit(
-        network, registration, PartFrames(2), CommonShape(2), ViewSearch(2), ObjectFrame(), options.proportions
-    )
+    return final_fit(true_shape(OVEN, data), states)
 
 
 def _at(final: FinalFit, data, state: torch.Tensor) -> Hypotheses:

@@ -7,17 +7,10 @@ import pytest
 import roma
 import torch
 from articulated_objects import OVEN, clouds, true_shape
-from true_category import Category
+from true_category import final_fit
 
-from articulate_ssl.inference.common_shape import CommonShape
-from articulate_ssl.inference.final_fit import FinalFit
-from articulate_ssl.inference.hypothesis_registration import HypothesisRegistration
-from articulate_ssl.inference.object_frame import ObjectFrame
-from articulate_ssl.inference.options import InferenceOptions
-from articulate_ssl.inference.part_frames import PartFrames
 from articulate_ssl.inference.square_search import SquareSearch
 from articulate_ssl.inference.state_range import StateRange
-from articulate_ssl.inference.view_search import ViewSearch
 from articulate_ssl.shape.observation import Observation
 
 NEARLY_CLOSED = (*OVEN[:3], [(0.05, 0.25)], OVEN[4])
@@ -30,17 +23,11 @@ def data():
 
 @pytest.fixture
 def search(data) -> SquareSearch:
-    shape = true_shape(OVEN, data)
-    order = shape.label.argsort(stable=True)
-    states, frames = StateRange(1), PartFrames(2)
+    states = StateRange(1)
     states.seen.copy_(torch.tensor([[0.6, 1.6]]))
     states.limits.copy_(states.seen)
-    frames.flat.fill_(True)
-    options = InferenceOptions(refine=True, proportions=6)
-    registration = HypothesisRegistration(options, Observation(), states)
-    network = Category(replace(shape, points=shape.points[order], label=shape.label[order]))
-    network.num_parts = 2
-    final = FinalFit(network, registration, frames, CommonShape(2), ViewSearch(2), ObjectFrame(), options.proportions)
+    final = final_fit(true_shape(OVEN, data), states)
+    final.part_frames.flat.fill_(True)
     return SquareSearch(final)
 
 
