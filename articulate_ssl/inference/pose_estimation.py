@@ -35,6 +35,7 @@ from torch import Tensor
 
 from articulate_ssl.discovery.registration import chamfer_l1
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
+from articulate_ssl.inference.box_turns import BoxTurns
 from articulate_ssl.inference.candidates import (
     ANOTHER_WAY,
     Candidates,
@@ -98,6 +99,7 @@ class PoseEstimator(Proposals):
         front_ends: Which ends of what slides views show, if it was learnt; a module owns it.
         states: Which joint states training clouds showed; a module owns it.
         pose_network: Which poses fits would say, if that was taught; a module owns it.
+        box_turns: Which way round boxes with doors look right, if that was taught; a module owns it.
     """
 
     def __init__(
@@ -121,6 +123,7 @@ class PoseEstimator(Proposals):
         self.object_frame = ObjectFrame()
         self.front_ends = FrontEnds(articulated.num_parts - 1)
         self.pose_network = PoseNetwork(articulated.num_parts)
+        self.box_turns = BoxTurns()
         super().__init__(articulated, rigid, iterations, replace(observation, camera=self.hinge_sides.camera))
         self.registration = HypothesisRegistration(inference, self.observation, self.states)
         self.decision = Decision(articulated, self.registration, self.two_ways)
@@ -134,7 +137,7 @@ class PoseEstimator(Proposals):
             inference.proportions,
         )
         self.other_hinges = OtherHinges(self.final, self.hinge_sides.camera)
-        self.square_search = SquareSearch(self.final)
+        self.square_search = SquareSearch(self.final, self.hinge_sides, self.box_turns)
 
     @property
     def reads_dense(self) -> bool:

@@ -9,11 +9,18 @@ each of these rotations and from joint states up to that of a closed door. Where
 than the explanation, where this has a state that training did not show, or hardly fits better than its rival, the few
 that fit best take the cloud's own proportions, without which fits do not tell, and the nearest explanation wins.
 
+Of boxes that are closed even the nearest is often wrong, as a box is one any way round. What it looks like says more
+(`box_turns`), if that was taught: where it is sure, only what is turned as it says is tried, and what is not gives way.
+
 Views show too little of a box for that, and plates say nothing about which of them is which.
 """
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
+import roma
 import torch
 from torch import Tensor
 
@@ -22,10 +29,11 @@ from articulate_ssl.discovery.registration import register_articulated
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import se3
+from articulate_ssl.inference.box_turns import BoxTurns
 from articulate_ssl.inference.candidates import ANOTHER_WAY, angle_to
 from articulate_ssl.inference.contest import Contest
 from articulate_ssl.inference.final_fit import FinalFit
-from articulate_ssl.inference.hinge_sides import closed_state
+from articulate_ssl.inference.hinge_sides import DECIDED, HingeSides, closed_state
 from articulate_ssl.network.hypotheses import Hypotheses
 
 # All chosen on development ovens (docs/experiments.md, step 274).
@@ -39,15 +47,70 @@ _CLEARLY = 0.95
 _THICK = 0.25
 
 
+class _Squares(NamedTuple):
+    """Of B clouds C explanations that are square to their faces, those to be tried first in front.
+
+    Attributes:
+        base: [B, C, 4, 4]
+        state: [B, C, 1]
+        allowed: [B, C] bool, which are tried.
+        unseen: [B] bool, whether training did not show how the door of what is decided for stands.
+        asked: [B] bool, whether any are.
+        least: [B] share of the error of what is decided for, that the first has to be below to take its place.
+        then: [B] the same, of what took it.
+    """
+
+    base: Tensor
+    state: Tensor
+    allowed: Tensor
+    unseen: Tensor
+    asked: Tensor
+    least: Tensor
+    then: Tensor
+
+    def rows(self, rows: Tensor) -> _Squares:
+        """Some of the clouds."""
+        return _Squares(*(one[rows] for one in self))
+
+    def looking_right(
+        self,
+        one: Hypotheses,  # H = 1, what is decided for
+        ways: Tensor,  # [B, W, 3, 3] base rotations that look right, of objects hinged as most are first
+        odds: Tensor,  # [B] logarithms
+    ) -> _Squares:
+        """Where looks decide, what looks wrong gives way to whatever looks right.
+
+        Objects that are hinged elsewhere than most are rare: what is hinged as most are comes first, and gives way to
+        what is not if that fits clearly better.
+        """
+        decided, turn, own = odds > DECIDED, self.base[..., :3, :3], one.base[..., :3, :3]
+        most, right = _turned_as(ways[:, :1], turn), _turned_as(ways, turn)
+        as_most, alike = _turned_as(ways[:, :1], own)[:, 0], _turned_as(ways, own)[:, 0]
+        order = ((~most).int() + 2 * (~right).int()) * decided[:, None]
+        order = order.argsort(dim=1, stable=True)
+        rows, anew = torch.arange(len(order), device=order.device)[:, None], decided & ~as_most
+        return _Squares(
+            self.base[rows, order],
+            self.state[rows, order],
+            (right | ~decided[:, None])[rows, order],
+            self.unseen,
+            torch.where(decided, self.unseen | ~as_most, self.asked),
+            torch.where(anew, torch.where(alike, 1 / _CLEARLY, torch.inf), self.least),
+            torch.where(anew, _CLEARLY, self.then),
+        )
+
+
 class SquareSearch:
     """See above.
 
     Args:
         final: How explanations are fitted in the end, by a registration that says which joint states there are.
+        sides: At which other sides some objects are hinged.
+        turns: Which way round boxes look right.
     """
 
-    def __init__(self, final: FinalFit) -> None:
-        self.final = final
+    def __init__(self, final: FinalFit, sides: HingeSides, turns: BoxTurns) -> None:
+        self.final, self.sides, self.turns = final, sides, turns
 
     @property
     def known(self) -> bool:
@@ -78,31 +141,77 @@ class SquareSearch:
         points: Tensor,  # [B, N, 3]
         dense: Tensor | None,  # [B, P, 3]
     ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
-        """Explanations, or those square to the clouds' faces that fit better."""
-        final, states = self.final, self.final.registration.states
+        """Explanations, or those square to the clouds' faces that fit better, or look right."""
         if not self.known or dense is None:
             return one, rival, margin
-        base, state = self._square(points, dense)
-        showed = states.showed(one.state[:, 0])
+        frames, _ = manhattan_frames(dense, torch.Generator().manual_seed(0))  # of clouds
+        squares = self._squares(one, margin, points, frames)
+        if not self.turns.learnt:
+            return self._tried(squares, one, rival, margin, points, dense)
+        ways, odds = self._look_right(dense, frames)
+        squares = squares.looking_right(one, ways, odds)
+        one, rival, margin = self._tried(squares, one, rival, margin, points, dense)
+        confirmed = (odds > DECIDED) & _turned_as(ways, one.base[..., :3, :3])[:, 0]
+        return one, rival, torch.where(confirmed, margin.maximum((odds / 2).tanh()), margin)
+
+    def _squares(
+        self,
+        one: Hypotheses,  # H = 1
+        margin: Tensor,  # [B]
+        points: Tensor,  # [B, N, 3]
+        frames: Tensor,  # [B, 3, 3] of the clouds
+    ) -> _Squares:
+        """What may take the place of explanations, by how well it fits."""
+        base, state = self._square(points, frames)
+        showed = self.final.registration.states.showed(one.state[:, 0])
         another = angle_to(one.base[..., :3, :3], base[:, 0, :3, :3])[:, 0] > ANOTHER_WAY
-        rows = (~showed | another | (margin < _UNSURE)).nonzero()[:, 0]
+        allowed = torch.ones_like(state[..., 0], dtype=torch.bool)
+        least = torch.where(showed, _CLEARLY, 1.0)
+        return _Squares(
+            base, state, allowed, ~showed, ~showed | another | (margin < _UNSURE), least, torch.ones_like(least)
+        )
+
+    def _tried(
+        self,
+        squares: _Squares,
+        one: Hypotheses,  # H = 1
+        rival: Hypotheses,  # H = 1
+        margin: Tensor,  # [B]
+        points: Tensor,  # [B, N, 3]
+        dense: Tensor,  # [B, P, 3]
+    ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
+        """Explanations, or what fits better, once it has the clouds' proportions."""
+        final, rows = self.final, squares.asked.nonzero()[:, 0]
         if not len(rows):
             return one, rival, margin
-        own, seen, least = points[rows], dense[rows], torch.where(showed[rows], _CLEARLY, 1.0)
-        base, state = base[rows], state[rows]
-        start = one.rows(rows), rival.rows(rows), margin[rows]
-        contest = Contest(*start, final.distance(start[0], own), self._as_rival)
-        for k in range(min(_TRIED, base.shape[1])):
-            tried = final.articulated.category_at(base[:, k : k + 1], state[:, k : k + 1])
-            tried = final.in_proportion(tried, own, seen)
-            allowed = states.contains(tried.state[:, 0])
-            contest, won = contest.against(tried, final.distance(tried, own), allowed, least)
-            least = least.index_fill(0, won, 1.0)
-        return (
-            one.with_rows(rows, contest.one),
-            rival.with_rows(rows, contest.rival),
-            margin.index_copy(0, rows, contest.margin),
-        )
+        own, seen, squares = points[rows], dense[rows], squares.rows(rows)
+        start, least = one.rows(rows), squares.least
+        contest = Contest(start, rival.rows(rows), margin[rows], final.distance(start, own), self._as_rival)
+        for k in range(min(_TRIED, squares.base.shape[1])):
+            some = squares.allowed[:, k].nonzero()[:, 0]
+            if not len(some):
+                break
+            tried = final.articulated.category_at(squares.base[some, k : k + 1], squares.state[some, k : k + 1])
+            tried = final.in_proportion(tried, own[some], seen[some])
+            error = torch.full_like(least, torch.inf).index_copy(0, some, final.distance(tried, own[some]))
+            tried = contest.one.with_rows(some, tried)
+            within = final.registration.states.contains(tried.state[:, 0])
+            contest, won = contest.against(tried, error, within, least)
+            least = least.index_copy(0, won, squares.then[won])
+        margin = margin.index_copy(0, rows, contest.margin)
+        return one.with_rows(rows, contest.one), rival.with_rows(rows, contest.rival), margin
+
+    def _look_right(
+        self,
+        dense: Tensor,  # [B, P, 3]
+        frames: Tensor,  # [B, 3, 3] of the clouds
+    ) -> tuple[Tensor, Tensor]:  # [B, W, 3, 3], [B]
+        """Base rotations that explain the likeliest look, of objects hinged as most are first, and its odds."""
+        turn, odds = self.turns.likeliest(dense, frames.mT[:, None] @ rotation_group(24).elements.to(frames))
+        if not self.sides.learnt:
+            return turn[:, None], odds
+        quarters = self.sides.quarters.to(turn) * (math.pi / 2)
+        return turn[:, None] @ roma.rotvec_to_rotmat(quarters[:, None] * self.sides.axes[:, 2]), odds
 
     def _as_rival(self, one: Hypotheses) -> Hypotheses:
         """The category's own shape, as rivals have it, where an explanation has that which clouds have in common."""
@@ -111,7 +220,7 @@ class SquareSearch:
     def _square(
         self,
         points: Tensor,  # [B, N, 3]
-        dense: Tensor,  # [B, P, 3]
+        frames: Tensor,  # [B, 3, 3] of the clouds
     ) -> tuple[Tensor, Tensor]:  # [B, C, 4, 4], [B, C, 1]
         """Base poses and joint states of registrations from the 24 rotations of the cube, best first."""
         final, states = self.final, self.final.registration.states
@@ -125,7 +234,6 @@ class SquareSearch:
         posed = shape.posed(torch.eye(4).to(points).expand(len(starts), 4, 4), starts)
         turned = torch.einsum("hij,qtj->hqti", rotations, posed)
         least, most = turned.amin(dim=2), turned.amax(dim=2)
-        frames, _ = manhattan_frames(dense, torch.Generator().manual_seed(0))  # of clouds
         inside = points @ frames.mT
         low, high = inside.amin(dim=1), inside.amax(dim=1)
         middle = (low + high) / 2
@@ -152,3 +260,11 @@ class SquareSearch:
         base = se3(frames.mT, torch.zeros_like(middle))[:, None] @ se3(base[..., :3, :3], shift)
         order = error.argsort(dim=1)
         return base[cloud, order], state[cloud, order]
+
+
+def _turned_as(
+    ways: Tensor,  # [B, W, 3, 3]
+    rotations: Tensor,  # [B, C, 3, 3]
+) -> Tensor:  # [B, C] bool
+    """Which rotations are about one of the ways."""
+    return torch.stack([angle_to(rotations, way) < ANOTHER_WAY for way in ways.unbind(1)]).any(dim=0)

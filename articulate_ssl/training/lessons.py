@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from articulate_ssl.geometry.screw import REVOLUTE
+from articulate_ssl.training.box_lessons import learn_box_turns
 from articulate_ssl.training.explanations import learn_handedness, learn_two_ways
 from articulate_ssl.training.frame_lessons import learn_part_frames
 from articulate_ssl.training.hinge_lessons import learn_hinge_sides
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 # and again when it is known how faces lie: that moves states.
 LESSONS = (
     *("first_limits", "two_ways", "turns", "objects", "handedness", "part_frames", "view_turns", "hinge_sides"),
-    *("joint_limits", "poses", "standing_part", "confidence"),
+    *("joint_limits", "poses", "box_turns", "standing_part", "confidence"),
 )
 
 
@@ -91,6 +92,7 @@ def plan(module: ArticulatedPoseModule) -> dict[str, Lesson]:
         "hinge_sides": Lesson(learn_hinge_sides, module.hinge_sides_samples if refines else 0),
         "joint_limits": limits,
         "poses": Lesson(learn_poses, module.pose_samples if refines and turns else 0),
+        "box_turns": Lesson(learn_box_turns, module.box_turns_samples if refines and turns and any_way else 0),
         "standing_part": Lesson(learn_standing_part, 0 if any_way else calibration),
         "confidence": Lesson(learn_confidence, calibration),
     }

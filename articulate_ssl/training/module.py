@@ -99,6 +99,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             than most (`inference.hinge_sides`); 0 learns nothing of it.
         pose_samples: Training clouds by whose registered predictions a network learns to say poses, where parts turn
             (`inference.pose_network`); half an hour, most of it to register them. 0 learns none.
+        box_turns_samples: Training clouds of boxes with doors, in which these are closed, by which a network learns
+            which way round boxes are (`inference.box_turns`); 15 minutes, most of it to register them. 0 learns none.
         orientation_range: How far objects are turned from their mean orientation at most, in degrees; 180 stands for
             any orientation, less where a camera is held upright.
 
@@ -126,6 +128,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         part_frames_samples: int = 256,
         hinge_sides_samples: int = 2000,
         pose_samples: int = 1600,
+        box_turns_samples: int = 640,
         orientation_range: float = 180.0,
     ) -> None:
         super().__init__()
@@ -145,7 +148,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         self.two_ways_samples, self.object_samples = two_ways_samples, object_samples
         self.handedness_samples = handedness_samples
         self.part_frames_samples, self.hinge_sides_samples = part_frames_samples, hinge_sides_samples
-        self.pose_samples = pose_samples
+        self.pose_samples, self.box_turns_samples = pose_samples, box_turns_samples
         require_at_least(self, **{name: 0 for name in options if name.endswith("_samples")})
 
         self.articulated = ArticulatedNetwork(network, num_parts, JOINT_TYPES[joint_type], state_bound=state_range)
@@ -160,7 +163,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         self.hinge_sides, self.states = self.estimator.hinge_sides, self.estimator.states
         self.part_frames, self.common_shape = self.estimator.part_frames, self.estimator.common_shape
         self.object_frame, self.front_ends = self.estimator.object_frame, self.estimator.front_ends
-        self.pose_network = self.estimator.pose_network
+        self.pose_network, self.box_turns = self.estimator.pose_network, self.estimator.box_turns
         self.recipe = recipe_type(self.estimator, objective, schedule, discovery)
         self.radius = RadiusStatistics()
         self.standing_part = StandingPart()
@@ -235,7 +238,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         """Adam; the category's shapes and joints are a group of their own."""
         shared = list(self.articulated.category.parameters())
         # What is learnt after the last step is not trained with the rest, nor when a run that ended goes on.
-        taught = self.two_ways, self.hinge_sides, self.sliding, self.view_search, self.object_frame, self.pose_network
+        taught = self.two_ways, self.hinge_sides, self.sliding, self.view_search, self.object_frame
+        taught += self.pose_network, self.box_turns
         elsewhere = set(map(id, (*shared, *(parameter for some in taught for parameter in some.parameters()))))
         others = [p for p in self.parameters() if id(p) not in elsewhere]
         optimizer = torch.optim.Adam(

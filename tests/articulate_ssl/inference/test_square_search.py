@@ -9,6 +9,8 @@ import torch
 from articulated_objects import OVEN, clouds, true_shape
 from true_category import final_fit
 
+from articulate_ssl.inference.box_turns import BoxTurns
+from articulate_ssl.inference.hinge_sides import HingeSides
 from articulate_ssl.inference.square_search import SquareSearch
 from articulate_ssl.inference.state_range import StateRange
 from articulate_ssl.shape.observation import Observation
@@ -28,7 +30,9 @@ def search(data) -> SquareSearch:
     states.limits.copy_(states.seen)
     final = final_fit(true_shape(OVEN, data), states)
     final.part_frames.flat.fill_(True)
-    return SquareSearch(final)
+    sides = HingeSides()
+    sides.axes.copy_(torch.tensor([[0.0, 0, -1], [1, 0, 0], [0, -1, 0]]))  # the door is in front, along x
+    return SquareSearch(final, sides, BoxTurns())
 
 
 def _at(search: SquareSearch, base, state):
@@ -106,6 +110,62 @@ def test_what_training_showed_gives_way_only_to_what_fits_clearly_better(search,
     one, rival, margin = search.sought(right, right, torch.zeros(4), data.points, data.points)
     assert (_off(one, data) > 60).all() and torch.equal(rival.base, right.base)
     torch.testing.assert_close(margin, torch.full((4,), 0.1))
+
+
+def _looking_right(search, monkeypatch, base, odds):
+    """The search, told by looks that objects are turned so."""
+    monkeypatch.setattr(BoxTurns, "learnt", True)
+    monkeypatch.setattr(search.turns, "likeliest", lambda *_: (base[:, :3, :3], torch.tensor(odds)))
+
+
+def test_what_looks_right_wins_however_well_another_fits(search, data, monkeypatch):
+    """And however sure that was, as far as looks decide; what is undecided stays."""
+    search.measure()
+    wrong, state = _turned(data)
+    _looking_right(search, monkeypatch, data.base, [9.0, 9.0, 1.0, 1.0])
+    squares = torch.stack([wrong, data.base], dim=1), torch.stack([state, data.state], dim=1)
+    monkeypatch.setattr(search, "_square", lambda *_: squares)
+    monkeypatch.setattr(search.final, "in_proportion", lambda tried, *_: tried)
+    worse = {True: 1.0, False: 0.5}  # what looks right fits half as well
+    right = [tuple(rotation.flatten().tolist()) for rotation in data.base[:, :3, :3]]
+    told = lambda one: [worse[tuple(x.flatten().tolist()) in right] for x in one.base[:, 0, :3, :3]]  # noqa: E731
+    monkeypatch.setattr(search.final, "distance", lambda one, _: torch.tensor(told(one)))
+    said = _at(search, wrong, state)
+    one, rival, margin = search.sought(said, said, torch.full((4,), 0.9), data.points, data.points)
+    assert (_off(one, data)[:2] < 10).all() and torch.equal(one.base[2:], said.base[2:])
+    assert torch.equal(rival.base[:2], said.base[:2])
+    torch.testing.assert_close(margin, torch.tensor([math.tanh(4.5)] * 2 + [0.9] * 2))
+
+
+def test_what_looks_right_as_training_showed_it_is_taken_as_it_is(search, data, monkeypatch):
+    """Whatever else would fit, and is believed as far as looks are."""
+    search.measure()
+    wrong, state = _turned(data)
+    _looking_right(search, monkeypatch, data.base, [3.0] * 4)
+    monkeypatch.setattr(search, "_square", lambda *_: (wrong[:, None], state[:, None]))
+    monkeypatch.setattr(search.final, "in_proportion", lambda *_: pytest.fail("tried in vain"))
+    right = _at(search, data.base, torch.full_like(data.state, 1.0))
+    one, _, margin = search.sought(right, right, torch.tensor([0.0, 0.5, 0.95, 1.0]), data.points, data.points)
+    assert one is right
+    torch.testing.assert_close(margin, torch.tensor([math.tanh(1.5)] * 2 + [0.95, 1.0]))
+
+
+@pytest.mark.parametrize("elsewhere", [0.9, 0.97])
+@pytest.mark.parametrize("learnt", [True, False])
+def test_hinges_at_other_sides_have_to_fit_clearly_better(search, data, monkeypatch, learnt, elsewhere):
+    """An object that stands as it looks may be hinged elsewhere, where some are; its explanation lies on its side."""
+    search.measure()
+    search.sides.learnt.fill_(learnt)
+    _looking_right(search, monkeypatch, data.base, [9.0] * 4)
+    lies = data.base.clone()
+    lies[:, :3, :3] = lies[:, :3, :3] @ roma.rotvec_to_rotmat(torch.tensor([math.pi / 2, 0.0, 0.0]))
+    squares = torch.stack([lies, data.base], dim=1), torch.stack([data.state, data.state], dim=1)
+    monkeypatch.setattr(search, "_square", lambda *_: squares)
+    monkeypatch.setattr(search.final, "in_proportion", lambda tried, *_: tried)
+    monkeypatch.setattr(search.final, "distance", lambda one, _: torch.where(_off(one, data) > 30, elsewhere, 1.0))
+    for said in (_at(search, *_turned(data)), _at(search, lies, torch.full_like(data.state, 1.0))):
+        one, _, _ = search.sought(said, said, torch.ones(4), data.points, data.points)
+        assert ((_off(one, data) > 30) == (learnt and elsewhere < 0.95)).all()
 
 
 @pytest.mark.parametrize("where", ["views", "plates", "not faces", "no dense points"])
