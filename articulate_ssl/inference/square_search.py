@@ -54,6 +54,7 @@ class _Squares(NamedTuple):
         base: [B, C, 4, 4]
         state: [B, C, 1]
         allowed: [B, C] bool, which are tried.
+        shown: [B, C] bool, which only count in joint states that training showed.
         unseen: [B] bool, whether training did not show how the door of what is decided for stands.
         asked: [B] bool, whether any are.
         least: [B] share of the error of what is decided for, that the first has to be below to take its place.
@@ -63,6 +64,7 @@ class _Squares(NamedTuple):
     base: Tensor
     state: Tensor
     allowed: Tensor
+    shown: Tensor
     unseen: Tensor
     asked: Tensor
     least: Tensor
@@ -81,7 +83,7 @@ class _Squares(NamedTuple):
         """Where looks decide, what looks wrong gives way to whatever looks right.
 
         Objects that are hinged elsewhere than most are rare: what is hinged as most are comes first, and gives way to
-        what is not if that fits clearly better.
+        what is not if that fits clearly better, and its door is open. Where a closed one is hinged, fits do not tell.
         """
         decided, turn, own = odds > DECIDED, self.base[..., :3, :3], one.base[..., :3, :3]
         most, right = _turned_as(ways[:, :1], turn), _turned_as(ways, turn)
@@ -93,6 +95,7 @@ class _Squares(NamedTuple):
             self.base[rows, order],
             self.state[rows, order],
             (right | ~decided[:, None])[rows, order],
+            (~most & decided[:, None])[rows, order],
             self.unseen,
             torch.where(decided, self.unseen | ~as_most, self.asked),
             torch.where(anew, torch.where(alike, 1 / _CLEARLY, torch.inf), self.least),
@@ -165,11 +168,9 @@ class SquareSearch:
         base, state = self._square(points, frames)
         showed = self.final.registration.states.showed(one.state[:, 0])
         another = angle_to(one.base[..., :3, :3], base[:, 0, :3, :3])[:, 0] > ANOTHER_WAY
-        allowed = torch.ones_like(state[..., 0], dtype=torch.bool)
-        least = torch.where(showed, _CLEARLY, 1.0)
-        return _Squares(
-            base, state, allowed, ~showed, ~showed | another | (margin < _UNSURE), least, torch.ones_like(least)
-        )
+        every, least = torch.ones_like(state[..., 0], dtype=torch.bool), torch.where(showed, _CLEARLY, 1.0)
+        asked = ~showed | another | (margin < _UNSURE)
+        return _Squares(base, state, every, ~every, ~showed, asked, least, torch.ones_like(least))
 
     def _tried(
         self,
@@ -195,7 +196,8 @@ class SquareSearch:
             tried = final.in_proportion(tried, own[some], seen[some])
             error = torch.full_like(least, torch.inf).index_copy(0, some, final.distance(tried, own[some]))
             tried = contest.one.with_rows(some, tried)
-            within = final.registration.states.contains(tried.state[:, 0])
+            states = final.registration.states
+            within = states.contains(tried.state[:, 0]) & (~squares.shown[:, k] | states.showed(tried.state[:, 0]))
             contest, won = contest.against(tried, error, within, least)
             least = least.index_copy(0, won, squares.then[won])
         margin = margin.index_copy(0, rows, contest.margin)
