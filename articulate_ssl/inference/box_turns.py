@@ -13,6 +13,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.inference.surface_decision import WithSurface
 
 
@@ -34,17 +35,15 @@ class BoxTurns(WithSurface):
         return self.surface is not None
 
     @torch.no_grad()
-    def likeliest(
+    def looks(
         self,
         dense: Tensor,  # [B, P, 3] farthest-point order
-        frames: Tensor,  # [B, 24, 3, 3] of the clouds, in every order of axes -> camera
-    ) -> tuple[Tensor, Tensor]:  # [B, 3, 3], [B]
-        """Rotations canonical object space -> camera that look right, and logarithms of their odds against all others.
+        frames: Tensor,  # [B, 3, 3] camera -> frame of the clouds (`manhattan_frames`)
+    ) -> tuple[Tensor, Tensor]:  # [B, 24, 3, 3], [B, 24]
+        """Rotations canonical object space -> camera, and logarithms of the probabilities that a box is turned so.
 
         A box that is hinged at another side than most stands as these do, and not as its hinge does.
         """
-        looks = self.surface.looks_right(frames, dense) / self.surface.temperature
-        best = looks.argmax(dim=1)
-        rows = torch.arange(len(best), device=best.device)
-        others = looks.index_put((rows, best), looks.new_tensor(-torch.inf)).logsumexp(dim=1)
-        return frames[rows, best] @ self.axes.mT.to(frames), looks[rows, best] - others
+        every = frames.mT[:, None] @ rotation_group(24).elements.to(frames)
+        looks = self.surface.looks_right(every, dense) / self.surface.temperature
+        return every @ self.axes.mT.to(frames), looks.log_softmax(dim=1)

@@ -77,30 +77,63 @@ class _Squares(NamedTuple):
     def looking_right(
         self,
         one: Hypotheses,  # H = 1, what is decided for
-        ways: Tensor,  # [B, W, 3, 3] base rotations that look right, of objects hinged as most are first
-        odds: Tensor,  # [B] logarithms
+        looks: _Looks,
     ) -> _Squares:
-        """Where looks decide, what looks wrong gives way to whatever looks right.
+        """What looks wrong gives way to what looks right; of that, what looks likeliest comes first.
 
-        Objects that are hinged elsewhere than most are rare: what is hinged as most are comes first, and gives way to
-        what is not if that fits clearly better, and its door is open. Where a closed one is hinged, fits do not tell.
+        It gives way to what fits clearly better: what looks about as likely, or is hinged elsewhere than most objects
+        are, as only open doors are known to be. Where a closed one is hinged, fits do not tell.
         """
-        decided, turn, own = odds > DECIDED, self.base[..., :3, :3], one.base[..., :3, :3]
-        most, right = _turned_as(ways[:, :1], turn), _turned_as(ways, turn)
-        as_most, alike = _turned_as(ways[:, :1], own)[:, 0], _turned_as(ways, own)[:, 0]
-        order = ((~most).int() + 2 * (~right).int()) * decided[:, None]
-        order = order.argsort(dim=1, stable=True)
-        rows, anew = torch.arange(len(order), device=order.device)[:, None], decided & ~as_most
+        most, right, order = looks.of(self.base[..., :3, :3])
+        as_most, alike, rank = (value[:, 0] for value in looks.of(one.base[..., :3, :3]))
+        order = order.argsort(dim=1, descending=True)
+        rows = torch.arange(len(order), device=order.device)[:, None]
+        behind = ~as_most | (self.unseen & (rank < 0))  # what looks likelier is believed before
         return _Squares(
             self.base[rows, order],
             self.state[rows, order],
-            (right | ~decided[:, None])[rows, order],
-            (~most & decided[:, None])[rows, order],
+            right[rows, order],
+            ~most[rows, order],
             self.unseen,
-            torch.where(decided, self.unseen | ~as_most, self.asked),
-            torch.where(anew, torch.where(alike, 1 / _CLEARLY, torch.inf), self.least),
-            torch.where(anew, _CLEARLY, self.then),
+            torch.where(looks.decided, self.unseen, self.asked) | ~as_most,
+            torch.where(alike, torch.where(behind, 1 / _CLEARLY, self.least), torch.inf),
+            torch.full_like(self.then, _CLEARLY),
         )
+
+
+class _Looks(NamedTuple):
+    """How right B boxes look in each of the 24 ways that they may be turned.
+
+    Attributes:
+        rotation: [B, 24, 3, 3] canonical object space -> camera.
+        likely: [B, 24] logarithms of probabilities.
+        quarters: [W, 3, 3] turns about the door's normal, of hinges that are elsewhere than most; none comes first.
+    """
+
+    rotation: Tensor
+    likely: Tensor
+    quarters: Tensor
+
+    @property
+    def decided(self) -> Tensor:
+        """[B] bool, whether one looks clearly likelier than all others."""
+        best = self.likely.topk(2, dim=1).values
+        return best[:, 0] - best[:, 1] > DECIDED
+
+    def of(
+        self,
+        turn: Tensor,  # [B, C, 3, 3] base rotations
+    ) -> tuple[Tensor, Tensor, Tensor]:  # [B, C] bool, [B, C] bool, [B, C]
+        """Whether what is turned so looks right if it is hinged as most are, or anyhow; and how far in front it comes.
+
+        That is a logarithm: 0 for what looks likeliest; what is hinged elsewhere comes behind.
+        """
+        stands = turn[:, :, None] @ self.quarters.mT  # [B, C, W, 3, 3]
+        near = torch.einsum("bcwij,bgij->bcwg", stands, self.rotation).argmax(dim=-1)
+        likely = self.likely - self.likely.amax(dim=1, keepdim=True)
+        found = likely.gather(1, near.flatten(1)).view(near.shape)
+        most, anyhow = found[..., 0], found.amax(dim=-1)
+        return most > -DECIDED, anyhow > -DECIDED, torch.where(most > -DECIDED, most, anyhow - 2 * DECIDED)
 
 
 class SquareSearch:
@@ -151,11 +184,12 @@ class SquareSearch:
         squares = self._squares(one, margin, points, frames)
         if not self.turns.learnt:
             return self._tried(squares, one, rival, margin, points, dense)
-        ways, odds = self._look_right(dense, frames)
-        squares = squares.looking_right(one, ways, odds)
+        looks = self._looks(dense, frames)
+        squares = squares.looking_right(one, looks)
         one, rival, margin = self._tried(squares, one, rival, margin, points, dense)
-        confirmed = (odds > DECIDED) & _turned_as(ways, one.base[..., :3, :3])[:, 0]
-        return one, rival, torch.where(confirmed, margin.maximum((odds / 2).tanh()), margin)
+        confirmed = looks.decided & looks.of(one.base[..., :3, :3])[1][:, 0]
+        sure = 2 * looks.likely.amax(dim=1).exp() - 1
+        return one, rival, torch.where(confirmed, margin.maximum(sure), margin)
 
     def _squares(
         self,
@@ -203,17 +237,14 @@ class SquareSearch:
         margin = margin.index_copy(0, rows, contest.margin)
         return one.with_rows(rows, contest.one), rival.with_rows(rows, contest.rival), margin
 
-    def _look_right(
+    def _looks(
         self,
         dense: Tensor,  # [B, P, 3]
         frames: Tensor,  # [B, 3, 3] of the clouds
-    ) -> tuple[Tensor, Tensor]:  # [B, W, 3, 3], [B]
-        """Base rotations that explain the likeliest look, of objects hinged as most are first, and its odds."""
-        turn, odds = self.turns.likeliest(dense, frames.mT[:, None] @ rotation_group(24).elements.to(frames))
-        if not self.sides.learnt:
-            return turn[:, None], odds
-        quarters = self.sides.quarters.to(turn) * (math.pi / 2)
-        return turn[:, None] @ roma.rotvec_to_rotmat(quarters[:, None] * self.sides.axes[:, 2]), odds
+    ) -> _Looks:
+        quarters = self.sides.quarters if self.sides.learnt else self.sides.quarters[:1]
+        about = quarters.to(frames)[:, None] * (math.pi / 2) * self.sides.axes[:, 2].to(frames)
+        return _Looks(*self.turns.looks(dense, frames), roma.rotvec_to_rotmat(about))
 
     def _as_rival(self, one: Hypotheses) -> Hypotheses:
         """The category's own shape, as rivals have it, where an explanation has that which clouds have in common."""
@@ -262,11 +293,3 @@ class SquareSearch:
         base = se3(frames.mT, torch.zeros_like(middle))[:, None] @ se3(base[..., :3, :3], shift)
         order = error.argsort(dim=1)
         return base[cloud, order], state[cloud, order]
-
-
-def _turned_as(
-    ways: Tensor,  # [B, W, 3, 3]
-    rotations: Tensor,  # [B, C, 3, 3]
-) -> Tensor:  # [B, C] bool
-    """Which rotations are about one of the ways."""
-    return torch.stack([angle_to(rotations, way) < ANOTHER_WAY for way in ways.unbind(1)]).any(dim=0)

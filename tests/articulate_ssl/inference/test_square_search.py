@@ -9,12 +9,14 @@ import torch
 from articulated_objects import OVEN, clouds, true_shape
 from true_category import final_fit
 
+from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.inference.box_turns import BoxTurns
 from articulate_ssl.inference.hinge_sides import HingeSides
 from articulate_ssl.inference.square_search import SquareSearch
 from articulate_ssl.inference.state_range import StateRange
 from articulate_ssl.shape.observation import Observation
 
+TURNED = roma.rotvec_to_rotmat(torch.tensor([0.0, math.pi / 2, 0.0]))
 NEARLY_CLOSED = (*OVEN[:3], [(0.05, 0.25)], OVEN[4])
 
 
@@ -42,7 +44,7 @@ def _at(search: SquareSearch, base, state):
 def _turned(data):
     """Ovens on their backs, doors opened as in training."""
     base = data.base.clone()
-    base[:, :3, :3] = base[:, :3, :3] @ roma.rotvec_to_rotmat(torch.tensor([0.0, math.pi / 2, 0.0]))
+    base[:, :3, :3] = base[:, :3, :3] @ TURNED
     return base, torch.full_like(data.state, 1.0)
 
 
@@ -112,42 +114,60 @@ def test_what_training_showed_gives_way_only_to_what_fits_clearly_better(search,
     torch.testing.assert_close(margin, torch.full((4,), 0.1))
 
 
-def _looking_right(search, monkeypatch, base, odds):
-    """The search, told by looks that objects are turned so."""
+def _looking_right(search, monkeypatch, data, odds):
+    """The search, told by looks that objects are turned as they are, and with what odds not as `_turned` ones."""
     monkeypatch.setattr(BoxTurns, "learnt", True)
-    monkeypatch.setattr(search.turns, "likeliest", lambda *_: (base[:, :3, :3], torch.tensor(odds)))
+    every = data.base[:, None, :3, :3] @ rotation_group(24).elements.float()
+    likely = torch.full((len(every), 24), -20.0)
+    likely[:, 0] = 0.0
+    turned = (every * (data.base[:, None, :3, :3] @ TURNED)).sum(dim=(-2, -1)).argmax(dim=1)
+    likely[torch.arange(len(every)), turned] = -torch.tensor(odds)
+    monkeypatch.setattr(search.turns, "looks", lambda *_: (every, likely.log_softmax(dim=1)))
 
 
-def test_what_looks_right_wins_however_well_another_fits(search, data, monkeypatch):
-    """And however sure that was, as far as looks decide; what is undecided stays."""
+def _fitting(search, monkeypatch, data, error):
+    """The search, told how well what is turned as objects are fits; the rest does by 1."""
+    right = [tuple(rotation.flatten().tolist()) for rotation in data.base[:, :3, :3]]
+
+    def distance(one, _points):
+        turned = [tuple(rotation.flatten().tolist()) for rotation in one.base[:, 0, :3, :3]]
+        return torch.tensor([error if rotation in right else 1.0 for rotation in turned])
+
+    monkeypatch.setattr(search.final, "in_proportion", lambda tried, *_: tried)
+    monkeypatch.setattr(search.final, "distance", distance)
+
+
+@pytest.mark.parametrize("error", [2.0, 1.02])
+def test_what_looks_right_comes_first_and_what_looks_wrong_gives_way(search, data, monkeypatch, error):
+    """However well that fits, and however sure it was; what is undecided stays, unless its door is too far closed."""
     search.measure()
     wrong, state = _turned(data)
-    _looking_right(search, monkeypatch, data.base, [9.0, 9.0, 1.0, 1.0])
+    _looking_right(search, monkeypatch, data, [9.0, 9.0, 1.0, 1.0])
+    _fitting(search, monkeypatch, data, error)
     squares = torch.stack([wrong, data.base], dim=1), torch.stack([state, data.state], dim=1)
     monkeypatch.setattr(search, "_square", lambda *_: squares)
-    monkeypatch.setattr(search.final, "in_proportion", lambda tried, *_: tried)
-    worse = {True: 1.0, False: 0.5}  # what looks right fits half as well
-    right = [tuple(rotation.flatten().tolist()) for rotation in data.base[:, :3, :3]]
-    told = lambda one: [worse[tuple(x.flatten().tolist()) in right] for x in one.base[:, 0, :3, :3]]  # noqa: E731
-    monkeypatch.setattr(search.final, "distance", lambda one, _: torch.tensor(told(one)))
     said = _at(search, wrong, state)
     one, rival, margin = search.sought(said, said, torch.full((4,), 0.9), data.points, data.points)
-    assert (_off(one, data)[:2] < 10).all() and torch.equal(one.base[2:], said.base[2:])
+    assert torch.equal(one.base[:2, 0], data.base[:2]) and torch.equal(one.base[2:], said.base[2:])
     assert torch.equal(rival.base[:2], said.base[:2])
     torch.testing.assert_close(margin, torch.tensor([math.tanh(4.5)] * 2 + [0.9] * 2))
+    closed = _at(search, wrong, data.state)
+    one, _, _ = search.sought(closed, closed, torch.full((4,), 0.9), data.points, data.points)
+    assert torch.equal(one.base[:2, 0], data.base[:2])
+    assert torch.equal(one.base[2:, 0], (data.base if error < 1.05 else wrong)[2:])
 
 
 def test_what_looks_right_as_training_showed_it_is_taken_as_it_is(search, data, monkeypatch):
     """Whatever else would fit, and is believed as far as looks are."""
     search.measure()
     wrong, state = _turned(data)
-    _looking_right(search, monkeypatch, data.base, [3.0] * 4)
+    _looking_right(search, monkeypatch, data, [3.0] * 4)
     monkeypatch.setattr(search, "_square", lambda *_: (wrong[:, None], state[:, None]))
     monkeypatch.setattr(search.final, "in_proportion", lambda *_: pytest.fail("tried in vain"))
     right = _at(search, data.base, torch.full_like(data.state, 1.0))
     one, _, margin = search.sought(right, right, torch.tensor([0.0, 0.5, 0.95, 1.0]), data.points, data.points)
     assert one is right
-    torch.testing.assert_close(margin, torch.tensor([math.tanh(1.5)] * 2 + [0.95, 1.0]))
+    torch.testing.assert_close(margin, torch.tensor([math.tanh(1.5)] * 2 + [0.95, 1.0]), atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize(
@@ -160,7 +180,7 @@ def test_hinges_at_other_sides_have_to_fit_clearly_better(search, data, monkeypa
     """
     search.measure()
     search.sides.learnt.fill_(learnt)
-    _looking_right(search, monkeypatch, data.base, [9.0] * 4)
+    _looking_right(search, monkeypatch, data, [9.0] * 4)
     lies = data.base.clone()
     lies[:, :3, :3] = lies[:, :3, :3] @ roma.rotvec_to_rotmat(torch.tensor([math.pi / 2, 0.0, 0.0]))
     state = torch.full_like(data.state, opened)
