@@ -18,6 +18,7 @@ Views show too little of a box for that, and plates say nothing about which of t
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import roma
@@ -34,6 +35,7 @@ from articulate_ssl.inference.candidates import ANOTHER_WAY, angle_to
 from articulate_ssl.inference.contest import Contest
 from articulate_ssl.inference.final_fit import FinalFit
 from articulate_ssl.inference.hinge_sides import DECIDED, HingeSides, closed_state
+from articulate_ssl.inference.state_range import StateRange
 from articulate_ssl.network.hypotheses import Hypotheses
 
 # All chosen on development ovens (docs/experiments.md, step 274).
@@ -43,6 +45,10 @@ _STRETCHED = 1.6  # at most, or its inverse
 _POINTS, _SCALES, _ROUNDS = 128, (0.06, 0.03), 4  # of the registration
 # Its error has to be below this share of that of what training showed: others explain a few of those by 4 % less.
 _CLEARLY = 0.95
+_REGISTERED = (
+    0.15  # of the width of a joint's range, beyond it: registration, before proportions, is as far off. Chosen.
+)
+_AT_ONCE = 4  # clouds whose explanations take proportions: on a CPU, of one alone that takes three times as long
 # Of its largest extent the smallest of a box at least (bodies of the package: .66 to .83, plates: .07 and .09).
 _THICK = 0.25
 
@@ -57,8 +63,8 @@ class _Squares(NamedTuple):
         shown: [B, C] bool, which only count in joint states that training showed.
         unseen: [B] bool, whether training did not show how the door of what is decided for stands.
         asked: [B] bool, whether any are.
-        least: [B] share of the error of what is decided for, that the first has to be below to take its place.
-        then: [B] the same, of what took it.
+        least: [B] share of the error of what is decided for, that another has to be below to take its place.
+        then: [B, C] the same, of what took it.
     """
 
     base: Tensor
@@ -78,6 +84,7 @@ class _Squares(NamedTuple):
         self,
         one: Hypotheses,  # H = 1, what is decided for
         looks: _Looks,
+        states: StateRange,
     ) -> _Squares:
         """What looks wrong gives way to what looks right; of that, what looks likeliest comes first.
 
@@ -86,18 +93,28 @@ class _Squares(NamedTuple):
         """
         most, right, order = looks.of(self.base[..., :3, :3])
         as_most, alike, rank = (value[:, 0] for value in looks.of(one.base[..., :3, :3]))
-        order = order.argsort(dim=1, descending=True)
+        # Registration may leave a closed door open: what is hinged as most are is tried with it closed, too.
+        base, state = (
+            torch.cat([self.base] * 2, dim=1),
+            torch.cat([self.state, states.rest.to(self.state).expand_as(self.state)], dim=1),
+        )
+        allowed = right & (most | states.showed(self.state, _REGISTERED))
+        allowed, shown = torch.cat([allowed, right & most], dim=1), torch.cat([~most] * 2, dim=1)
+        then = torch.full_like(order, _CLEARLY)
+        then = torch.cat([then, torch.where(order < 0, then, 1.0)], dim=1)
+        order = torch.cat([order] * 2, dim=1).masked_fill(~allowed, -torch.inf)
+        order = order.argsort(dim=1, descending=True, stable=True)
         rows = torch.arange(len(order), device=order.device)[:, None]
         behind = ~as_most | (self.unseen & (rank < 0))  # what looks likelier is believed before
         return _Squares(
-            self.base[rows, order],
-            self.state[rows, order],
-            right[rows, order],
-            ~most[rows, order],
+            base[rows, order],
+            state[rows, order],
+            allowed[rows, order],
+            shown[rows, order],
             self.unseen,
             torch.where(looks.decided, self.unseen, self.asked) | ~as_most,
             torch.where(alike, torch.where(behind, 1 / _CLEARLY, self.least), torch.inf),
-            torch.full_like(self.then, _CLEARLY),
+            then[rows, order],
         )
 
 
@@ -185,7 +202,7 @@ class SquareSearch:
         if not self.turns.learnt:
             return self._tried(squares, one, rival, margin, points, dense)
         looks = self._looks(dense, frames)
-        squares = squares.looking_right(one, looks)
+        squares = squares.looking_right(one, looks, self.final.registration.states)
         one, rival, margin = self._tried(squares, one, rival, margin, points, dense)
         confirmed = looks.decided & looks.of(one.base[..., :3, :3])[1][:, 0]
         sure = 2 * looks.likely.amax(dim=1).exp() - 1
@@ -204,7 +221,7 @@ class SquareSearch:
         another = angle_to(one.base[..., :3, :3], base[:, 0, :3, :3])[:, 0] > ANOTHER_WAY
         every, least = torch.ones_like(state[..., 0], dtype=torch.bool), torch.where(showed, _CLEARLY, 1.0)
         asked = ~showed | another | (margin < _UNSURE)
-        return _Squares(base, state, every, ~every, ~showed, asked, least, torch.ones_like(least))
+        return _Squares(base, state, every, ~every, ~showed, asked, least, every.to(least))
 
     def _tried(
         self,
@@ -216,26 +233,40 @@ class SquareSearch:
         dense: Tensor,  # [B, P, 3]
     ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
         """Explanations, or what fits better, once it has the clouds' proportions."""
-        final, rows = self.final, squares.asked.nonzero()[:, 0]
-        if not len(rows):
-            return one, rival, margin
-        own, seen, squares = points[rows], dense[rows], squares.rows(rows)
-        start, least = one.rows(rows), squares.least
-        contest = Contest(start, rival.rows(rows), margin[rows], final.distance(start, own), self._as_rival)
-        for k in range(min(_TRIED, squares.base.shape[1])):
-            some = squares.allowed[:, k].nonzero()[:, 0]
-            if not len(some):
-                break
-            tried = final.articulated.category_at(squares.base[some, k : k + 1], squares.state[some, k : k + 1])
-            tried = final.in_proportion(tried, own[some], seen[some])
-            error = torch.full_like(least, torch.inf).index_copy(0, some, final.distance(tried, own[some]))
-            tried = contest.one.with_rows(some, tried)
-            states = final.registration.states
-            within = states.contains(tried.state[:, 0]) & (~squares.shown[:, k] | states.showed(tried.state[:, 0]))
-            contest, won = contest.against(tried, error, within, least)
-            least = least.index_copy(0, won, squares.then[won])
-        margin = margin.index_copy(0, rows, contest.margin)
-        return one.with_rows(rows, contest.one), rival.with_rows(rows, contest.rival), margin
+        asked = squares.asked.nonzero()[:, 0]
+        for rows in asked.split(_AT_ONCE) if len(asked) else ():
+            own, some = points[rows], squares.rows(rows)
+            start, first = one.rows(rows), torch.ones_like(some.asked)
+            contest = Contest(start, rival.rows(rows), margin[rows], self.final.distance(start, own), self._as_rival)
+            for k, (which, tried, error, allowed) in enumerate(self._fits(some, own, dense[rows])):
+                tried = contest.one.with_rows(which, tried)
+                least = torch.where(first, some.least, some.then[:, k])
+                error = torch.full_like(least, torch.inf).index_copy(0, which, error)
+                allowed = torch.zeros_like(first).index_copy(0, which, allowed)
+                contest, won = contest.against(tried, error, allowed, least)
+                first = first.index_fill(0, won, False)
+            one, rival = one.with_rows(rows, contest.one), rival.with_rows(rows, contest.rival)
+            margin = margin.index_copy(0, rows, contest.margin)
+        return one, rival, margin
+
+    def _fits(
+        self,
+        squares: _Squares,  # of b clouds
+        points: Tensor,  # [b, N, 3]
+        dense: Tensor,  # [b, P, 3]
+    ) -> Iterator[tuple[Tensor, Hypotheses, Tensor, Tensor]]:  # [n], H = 1, [n], [n] bool
+        """What is tried, in proportion, what comes first before: of which clouds, its error, and whether it may win."""
+        final, states = self.final, self.final.registration.states
+        cloud, rank = squares.allowed[:, :_TRIED].nonzero().unbind(dim=1)
+        if not len(cloud):
+            return
+        tried = final.articulated.category_at(squares.base[cloud, rank, None], squares.state[cloud, rank, None])
+        tried = final.in_proportion(tried, points[cloud], dense[cloud])
+        error, state = final.distance(tried, points[cloud]), tried.state[:, 0]
+        allowed = states.contains(state) & (~squares.shown[cloud, rank] | states.showed(state))
+        for k in range(int(rank.max()) + 1):
+            some = (rank == k).nonzero()[:, 0]
+            yield cloud[some], tried.rows(some), error[some], allowed[some]
 
     def _looks(
         self,

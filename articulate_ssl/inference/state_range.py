@@ -92,9 +92,10 @@ class StateRange(nn.Module):
     def showed(
         self,
         state: Tensor,  # [..., J]
+        slack: float = _SLACK,
     ) -> Tensor:  # [...] bool
-        """Whether training clouds showed it, or about; everything, until it is known."""
-        return self._within(self.seen, state, _SLACK)
+        """Whether training clouds showed it, or about; everything, until it is known. `slack` as of `contains`."""
+        return self._within(self.seen, state, slack)
 
     def _within(self, limits: Tensor, state: Tensor, slack: float) -> Tensor:
         if not self.learnt:

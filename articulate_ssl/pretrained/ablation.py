@@ -78,6 +78,10 @@ def _no_network_of_poses(estimator: PoseEstimator) -> None:
     estimator.pose_network.network = None
 
 
+def _no_network_of_box_turns(estimator: PoseEstimator) -> None:
+    estimator.box_turns.surface = None
+
+
 def _no_network_of_views_parts(estimator: PoseEstimator) -> None:
     estimator.view_search.parts = None
 
@@ -110,6 +114,7 @@ ABLATIONS = (
         _no_network_of_view_turns,
     ),
     Ablation("the network that says poses", lambda of: of.pose_network.learnt, _no_network_of_poses),
+    Ablation("which way round boxes look right", lambda of: of.box_turns.learnt, _no_network_of_box_turns),
     Ablation("fronts of drawers", lambda of: of.front_ends.learnt, lambda of: of.front_ends.forget()),
     Ablation(
         "how views are square, and these networks",
