@@ -10,11 +10,49 @@ Manhattan frame, which leaves 24 rotations, and the network says which of them l
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
 from articulate_ssl.geometry.rotation_group import rotation_group
+from articulate_ssl.inference.hinge_sides import DECIDED
 from articulate_ssl.inference.surface_decision import WithSurface
+
+
+class Looks(NamedTuple):
+    """How right B boxes look in each of the 24 ways that they may be turned.
+
+    Attributes:
+        rotation: [B, 24, 3, 3] canonical object space -> camera.
+        likely: [B, 24] logarithms of probabilities.
+        hinges: [W, 3, 3] turns about the door's normal, of hinges that are elsewhere than most; none comes first.
+    """
+
+    rotation: Tensor
+    likely: Tensor
+    hinges: Tensor
+
+    @property
+    def decided(self) -> Tensor:
+        """[B] bool, whether one looks clearly likelier than all others."""
+        best = self.likely.topk(2, dim=1).values
+        return best[:, 0] - best[:, 1] > DECIDED
+
+    def of(
+        self,
+        turn: Tensor,  # [B, C, 3, 3] base rotations
+    ) -> tuple[Tensor, Tensor, Tensor]:  # [B, C] bool, [B, C] bool, [B, C]
+        """Whether what is turned so looks right if it is hinged as most are, or anyhow; and how far in front it comes.
+
+        That is a logarithm: 0 for what looks likeliest; what is hinged elsewhere comes behind.
+        """
+        stands = turn[:, :, None] @ self.hinges.mT  # [B, C, W, 3, 3]
+        near = torch.einsum("bcwij,bgij->bcwg", stands, self.rotation).argmax(dim=-1)
+        likely = self.likely - self.likely.amax(dim=1, keepdim=True)
+        found = likely.gather(1, near.flatten(1)).view(near.shape)
+        most, anyhow = found[..., 0], found.amax(dim=-1)
+        return most > -DECIDED, anyhow > -DECIDED, torch.where(most > -DECIDED, most, anyhow - 2 * DECIDED)
 
 
 class BoxTurns(WithSurface):
@@ -39,11 +77,12 @@ class BoxTurns(WithSurface):
         self,
         dense: Tensor,  # [B, P, 3] farthest-point order
         frames: Tensor,  # [B, 3, 3] camera -> frame of the clouds (`manhattan_frames`)
-    ) -> tuple[Tensor, Tensor]:  # [B, 24, 3, 3], [B, 24]
-        """Rotations canonical object space -> camera, and logarithms of the probabilities that a box is turned so.
+        hinges: Tensor,  # [W, 3, 3] see `Looks`
+    ) -> Looks:
+        """How right boxes look.
 
-        A box that is hinged at another side than most stands as these do, and not as its hinge does.
+        One that is hinged at another side than most stands as these do, and not as its hinge does.
         """
         every = frames.mT[:, None] @ rotation_group(24).elements.to(frames)
         looks = self.surface.looks_right(every, dense) / self.surface.temperature
-        return every @ self.axes.mT.to(frames), looks.log_softmax(dim=1)
+        return Looks(every @ self.axes.mT.to(frames), looks.log_softmax(dim=1), hinges.to(frames))

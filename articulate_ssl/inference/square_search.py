@@ -9,8 +9,8 @@ each of these rotations and from joint states up to that of a closed door. Where
 than the explanation, where this has a state that training did not show, or hardly fits better than its rival, the few
 that fit best take the cloud's own proportions, without which fits do not tell, and the nearest explanation wins.
 
-Of boxes that are closed even the nearest is often wrong, as a box is one any way round. What it looks like says more
-(`box_turns`), if that was taught: where it is sure, only what is turned as it says is tried, and what is not gives way.
+Of boxes that are closed even the nearest is often wrong, as a box is one any way round. What they look like says more
+(`box_turns`), if that was taught: only what looks right is tried, likeliest first, and what looks wrong gives way.
 
 Views show too little of a box for that, and plates say nothing about which of them is which.
 """
@@ -30,11 +30,11 @@ from articulate_ssl.discovery.registration import register_articulated
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import se3
-from articulate_ssl.inference.box_turns import BoxTurns
+from articulate_ssl.inference.box_turns import BoxTurns, Looks
 from articulate_ssl.inference.candidates import ANOTHER_WAY, angle_to
 from articulate_ssl.inference.contest import Contest
 from articulate_ssl.inference.final_fit import FinalFit
-from articulate_ssl.inference.hinge_sides import DECIDED, HingeSides, closed_state
+from articulate_ssl.inference.hinge_sides import HingeSides, closed_state
 from articulate_ssl.inference.state_range import StateRange
 from articulate_ssl.network.hypotheses import Hypotheses
 
@@ -45,9 +45,8 @@ _STRETCHED = 1.6  # at most, or its inverse
 _POINTS, _SCALES, _ROUNDS = 128, (0.06, 0.03), 4  # of the registration
 # Its error has to be below this share of that of what training showed: others explain a few of those by 4 % less.
 _CLEARLY = 0.95
-_REGISTERED = (
-    0.15  # of the width of a joint's range, beyond it: registration, before proportions, is as far off. Chosen.
-)
+# Of the width of a joint's range, beyond it: registration, before proportions, is as far off. Chosen.
+_REGISTERED = 0.15
 _AT_ONCE = 4  # clouds whose explanations take proportions: on a CPU, of one alone that takes three times as long
 # Of its largest extent the smallest of a box at least (bodies of the package: .66 to .83, plates: .07 and .09).
 _THICK = 0.25
@@ -83,7 +82,7 @@ class _Squares(NamedTuple):
     def looking_right(
         self,
         one: Hypotheses,  # H = 1, what is decided for
-        looks: _Looks,
+        looks: Looks,
         states: StateRange,
     ) -> _Squares:
         """What looks wrong gives way to what looks right; of that, what looks likeliest comes first.
@@ -94,10 +93,8 @@ class _Squares(NamedTuple):
         most, right, order = looks.of(self.base[..., :3, :3])
         as_most, alike, rank = (value[:, 0] for value in looks.of(one.base[..., :3, :3]))
         # Registration may leave a closed door open: what is hinged as most are is tried with it closed, too.
-        base, state = (
-            torch.cat([self.base] * 2, dim=1),
-            torch.cat([self.state, states.rest.to(self.state).expand_as(self.state)], dim=1),
-        )
+        closed = states.rest.to(self.state).expand_as(self.state)
+        base, state = torch.cat([self.base] * 2, dim=1), torch.cat([self.state, closed], dim=1)
         allowed = right & (most | states.showed(self.state, _REGISTERED))
         allowed, shown = torch.cat([allowed, right & most], dim=1), torch.cat([~most] * 2, dim=1)
         then = torch.full_like(order, _CLEARLY)
@@ -116,41 +113,6 @@ class _Squares(NamedTuple):
             torch.where(alike, torch.where(behind, 1 / _CLEARLY, self.least), torch.inf),
             then[rows, order],
         )
-
-
-class _Looks(NamedTuple):
-    """How right B boxes look in each of the 24 ways that they may be turned.
-
-    Attributes:
-        rotation: [B, 24, 3, 3] canonical object space -> camera.
-        likely: [B, 24] logarithms of probabilities.
-        quarters: [W, 3, 3] turns about the door's normal, of hinges that are elsewhere than most; none comes first.
-    """
-
-    rotation: Tensor
-    likely: Tensor
-    quarters: Tensor
-
-    @property
-    def decided(self) -> Tensor:
-        """[B] bool, whether one looks clearly likelier than all others."""
-        best = self.likely.topk(2, dim=1).values
-        return best[:, 0] - best[:, 1] > DECIDED
-
-    def of(
-        self,
-        turn: Tensor,  # [B, C, 3, 3] base rotations
-    ) -> tuple[Tensor, Tensor, Tensor]:  # [B, C] bool, [B, C] bool, [B, C]
-        """Whether what is turned so looks right if it is hinged as most are, or anyhow; and how far in front it comes.
-
-        That is a logarithm: 0 for what looks likeliest; what is hinged elsewhere comes behind.
-        """
-        stands = turn[:, :, None] @ self.quarters.mT  # [B, C, W, 3, 3]
-        near = torch.einsum("bcwij,bgij->bcwg", stands, self.rotation).argmax(dim=-1)
-        likely = self.likely - self.likely.amax(dim=1, keepdim=True)
-        found = likely.gather(1, near.flatten(1)).view(near.shape)
-        most, anyhow = found[..., 0], found.amax(dim=-1)
-        return most > -DECIDED, anyhow > -DECIDED, torch.where(most > -DECIDED, most, anyhow - 2 * DECIDED)
 
 
 class SquareSearch:
@@ -201,7 +163,7 @@ class SquareSearch:
         squares = self._squares(one, margin, points, frames)
         if not self.turns.learnt:
             return self._tried(squares, one, rival, margin, points, dense)
-        looks = self._looks(dense, frames)
+        looks = self.turns.looks(dense, frames, self._hinges())
         squares = squares.looking_right(one, looks, self.final.registration.states)
         one, rival, margin = self._tried(squares, one, rival, margin, points, dense)
         confirmed = looks.decided & looks.of(one.base[..., :3, :3])[1][:, 0]
@@ -268,14 +230,10 @@ class SquareSearch:
             some = (rank == k).nonzero()[:, 0]
             yield cloud[some], tried.rows(some), error[some], allowed[some]
 
-    def _looks(
-        self,
-        dense: Tensor,  # [B, P, 3]
-        frames: Tensor,  # [B, 3, 3] of the clouds
-    ) -> _Looks:
+    def _hinges(self) -> Tensor:  # [W, 3, 3]
+        """Turns about a door's normal, of hinges that are elsewhere than most, in canonical space; none comes first."""
         quarters = self.sides.quarters if self.sides.learnt else self.sides.quarters[:1]
-        about = quarters.to(frames)[:, None] * (math.pi / 2) * self.sides.axes[:, 2].to(frames)
-        return _Looks(*self.turns.looks(dense, frames), roma.rotvec_to_rotmat(about))
+        return roma.rotvec_to_rotmat(quarters[:, None] * (math.pi / 2) * self.sides.axes[:, 2])
 
     def _as_rival(self, one: Hypotheses) -> Hypotheses:
         """The category's own shape, as rivals have it, where an explanation has that which clouds have in common."""

@@ -1,11 +1,13 @@
 """Of the 24 rotations in which a box is square to its cloud's axes, the one that looks right is the box's."""
 
+import math
+
 import pytest
 import roma
 import torch
 
 from articulate_ssl.geometry.rotation_group import rotation_group
-from articulate_ssl.inference.box_turns import BoxTurns
+from articulate_ssl.inference.box_turns import BoxTurns, Looks
 from articulate_ssl.inference.surface_decision import SurfaceDecision
 
 CLOUDS = 5
@@ -35,7 +37,7 @@ def test_the_object_is_turned_as_a_frame_says(frames):
     right = torch.tensor([0, 3, 7, 11, 23])
     turns.surface = _Likes(right, 6.0)
     assert turns.learnt
-    rotation, likely = turns.looks(torch.zeros(CLOUDS, 8, 3), frames)
+    rotation, likely, _ = turns.looks(torch.zeros(CLOUDS, 8, 3), frames, torch.eye(3)[None])
     every = frames.mT[:, None] @ rotation_group(24).elements.float()
     torch.testing.assert_close(rotation @ turns.axes, every)
     assert torch.equal(likely.argmax(dim=1), right)
@@ -46,8 +48,26 @@ def test_looks_are_no_surer_than_the_network_is_right(frames):
     turns = BoxTurns()
     turns.surface = _Likes(torch.zeros(CLOUDS, dtype=torch.long), 6.0)
     turns.surface.temperature.fill_(3.0)
-    _, likely = turns.looks(torch.zeros(CLOUDS, 8, 3), frames)
+    likely = turns.looks(torch.zeros(CLOUDS, 8, 3), frames, torch.eye(3)[None]).likely
     torch.testing.assert_close(likely[:, 0] - likely[:, 1], torch.full((CLOUDS,), 6 / 3))
+
+
+def test_what_is_turned_as_looks_right_is_in_front_and_hinges_elsewhere_come_behind(frames):
+    """A box that looks right lies on its side as an explanation has it whose hinge is elsewhere."""
+    every = frames.mT[:, None] @ rotation_group(24).elements.float()
+    likely = torch.full((CLOUDS, 24), -9.0).index_fill(1, torch.tensor([4]), 0.0).index_fill(1, torch.tensor([9]), -1.0)
+    quarter = roma.rotvec_to_rotmat(math.pi / 2 * torch.tensor([[0.0, 0, 0], [0, 0, 1]]))
+    looks = Looks(every, likely, quarter)
+    assert not looks.decided.any()
+    tilt = roma.rotvec_to_rotmat(torch.tensor([0.2, 0.1, -0.1]))  # as registration leaves it
+    said = torch.stack([every[:, 4], every[:, 9], every[:, 4] @ quarter[1], every[:, 9] @ quarter[1]], dim=1) @ tilt
+    most, right, order = looks.of(said)
+    others = looks.of(every)[1].sum(dim=1)
+    assert most.tolist() == [[True, True, False, False]] * CLOUDS and right.all() and (others == 4).all()
+    assert (order[:, 0] == 0).all() and (order.diff(dim=1) < 0).all()
+    alone = Looks(every, likely, quarter[:1])
+    assert alone.of(said)[1].tolist() == [[True, True, False, False]] * CLOUDS
+    assert Looks(every, likely.index_fill(1, torch.tensor([9]), -2.5), quarter).decided.all()
 
 
 def test_weights_from_before_it_was_taught_have_none():

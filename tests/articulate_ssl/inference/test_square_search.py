@@ -10,7 +10,7 @@ from articulated_objects import OVEN, clouds, true_shape
 from true_category import final_fit
 
 from articulate_ssl.geometry.rotation_group import rotation_group
-from articulate_ssl.inference.box_turns import BoxTurns
+from articulate_ssl.inference.box_turns import BoxTurns, Looks
 from articulate_ssl.inference.hinge_sides import HingeSides
 from articulate_ssl.inference.square_search import SquareSearch
 from articulate_ssl.inference.state_range import StateRange
@@ -122,7 +122,7 @@ def _looking_right(search, monkeypatch, data, odds):
     likely[:, 0] = 0.0
     turned = (every * (data.base[:, None, :3, :3] @ TURNED)).sum(dim=(-2, -1)).argmax(dim=1)
     likely[torch.arange(len(every)), turned] = -torch.tensor(odds)
-    monkeypatch.setattr(search.turns, "looks", lambda *_: (every, likely.log_softmax(dim=1)))
+    monkeypatch.setattr(search.turns, "looks", lambda *seen: Looks(every, likely.log_softmax(dim=1), seen[-1]))
 
 
 def _fitting(search, monkeypatch, data, error):
