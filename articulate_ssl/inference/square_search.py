@@ -85,10 +85,11 @@ class _Squares(NamedTuple):
         looks: Looks,
         states: StateRange,
     ) -> _Squares:
-        """What looks wrong gives way to what looks right; of that, what looks likeliest comes first.
+        """What looks wrong gives way to what looks right, unless it fits clearly better and as training showed it.
 
-        It gives way to what fits clearly better: what looks about as likely, or is hinged elsewhere than most objects
-        are, as only open doors are known to be. Where a closed one is hinged, fits do not tell.
+        Of what looks right the likeliest comes first, and gives way to what fits clearly better: what looks about as
+        likely, or is hinged elsewhere than most objects are. Where a closed door is hinged, fits do not tell, so that
+        counts of open ones alone.
         """
         most, right, order = looks.of(self.base[..., :3, :3])
         as_most, alike, rank = (value[:, 0] for value in looks.of(one.base[..., :3, :3]))
@@ -102,7 +103,9 @@ class _Squares(NamedTuple):
         order = torch.cat([order] * 2, dim=1).masked_fill(~allowed, -torch.inf)
         order = order.argsort(dim=1, descending=True, stable=True)
         rows = torch.arange(len(order), device=order.device)[:, None]
-        behind = ~as_most | (self.unseen & (rank < 0))  # what looks likelier is believed before
+        # Where doors stand as training showed, fits that are clearly better are believed; where not, looks are.
+        against = torch.where(alike | ~self.unseen, 1 / _CLEARLY, torch.inf)
+        believed = alike & ~(self.unseen & (rank < 0))
         return _Squares(
             base[rows, order],
             state[rows, order],
@@ -110,7 +113,7 @@ class _Squares(NamedTuple):
             shown[rows, order],
             self.unseen,
             torch.where(looks.decided, self.unseen, self.asked) | ~as_most,
-            torch.where(alike, torch.where(behind, 1 / _CLEARLY, self.least), torch.inf),
+            torch.where(believed, self.least, against),
             then[rows, order],
         )
 
