@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -38,6 +38,39 @@ _VIEWS = 30  # that are simulated of every scan, each of an object with other pr
 log = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True)
+class StandingScans:
+    """Scans as they stand before the camera, of which views are simulated.
+
+    Attributes:
+        clouds: [m, P, 3] of objects, and of their mirror images.
+        found: The category's shape registered to them.
+        turns: [m, V, 3, 3] canonical object space -> camera, of V views of each.
+        mean_distance: Of a view's points to their centre.
+    """
+
+    clouds: Tensor
+    found: RegisteredShape
+    turns: Tensor
+    mean_distance: float
+
+    def views(
+        self,
+        num_points: int,
+        generator: np.random.Generator,
+        count: int | None = None,
+        limits: Tensor | None = None,
+    ) -> tuple[Tensor, RegisteredShape]:
+        """`simulate_views` [k, num_points, 3], each of an object with other proportions and joint states.
+
+        Args:
+            count: Of each scan at most; None are all.
+            limits: [J, 2] between which joint states are; None are those that scans show.
+        """
+        seen = self.clouds, self.turns[:, :count], num_points, self.mean_distance, generator
+        return simulate_views(self.found, *seen, reshape=True, limits=limits)
+
+
 @flush_denormals()
 def discover_from_scans(
     views: Tensor,  # [v, P, 3] depth views of the category
@@ -50,8 +83,8 @@ def discover_from_scans(
     orientation: OrientationRange,
     num_points: int,
     to_stand: Callable[[RegisteredShape, Tensor, Tensor], tuple[Tensor, Tensor]],
-) -> tuple[Tensor, RegisteredShape]:
-    """Simulated views [k, num_points, 3], and parts and joints of the category registered to them.
+) -> tuple[Tensor, RegisteredShape, StandingScans]:
+    """Simulated views [k, num_points, 3], parts and joints of the category registered to them; and of what they are.
 
     Args:
         orientation: How far objects are turned in the views.
@@ -85,10 +118,10 @@ def discover_from_scans(
         turns = turns @ (stand.mean @ lying[kept].mT @ stand.mean.mT)[:, None]
     found, clouds = replace(found.of_clouds(kept), quarters=quarters[kept]), clouds[kept]
     _announce(1, "views of the scans")
-    turns = turns.reshape(len(kept), _VIEWS, 3, 3)
-    simulated = simulate_views(found, clouds, turns, num_points, mean_distance, random, reshape=True)
+    standing = StandingScans(clouds, found, turns.reshape(len(kept), _VIEWS, 3, 3), mean_distance)
+    simulated = standing.views(num_points, random)
     _announce(2, "done")
-    return simulated
+    return *simulated, standing
 
 
 def _likeliest(found: RegisteredShape, clouds: Tensor) -> Tensor:  # [n]

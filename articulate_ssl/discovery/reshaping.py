@@ -61,12 +61,16 @@ class Reshaping:
         """The clouds as they are."""
         return Reshaped(self._points, self._normals, self._found.state)
 
-    def draw(self, generator: torch.Generator) -> Reshaped:
-        """Proportions and joint states of every cloud anew, states evenly within what the clouds show."""
+    def draw(
+        self,
+        generator: torch.Generator,
+        limits: Tensor | None = None,  # [J, 2]
+    ) -> Reshaped:
+        """Proportions and joint states of every cloud anew, states evenly within limits, or what the clouds show."""
         state = self._found.state
         log_scale = _SPREAD * (2 * torch.rand(len(state), 3, generator=generator) - 1)
         log_scale = log_scale - log_scale.mean(dim=1, keepdim=True)  # as large as before
-        low, high = self._found.limits().unbind(-1)
+        low, high = (self._found.limits() if limits is None else limits).to(state).unbind(-1)
         return self.at(log_scale.to(state), low + (high - low) * torch.rand(state.shape, generator=generator).to(state))
 
     def at(

@@ -34,6 +34,7 @@ def simulate_views(
     mean_distance: float,
     generator: np.random.Generator,
     reshape: bool = False,
+    limits: Tensor | None = None,
 ) -> tuple[Tensor, RegisteredShape]:
     """V views [n, N, 3] of every cloud, in the camera's frame, and the shape registered to them.
 
@@ -45,6 +46,7 @@ def simulate_views(
         mean_distance: Of a view's points to their centre, as its pixels count them; views are normalised to it.
         generator: Of the camera's distance, and of proportions.
         reshape: Whether each view is of another object, with other proportions and joint states (`reshaping`).
+        limits: [J, 2] between which these states are; None are those that clouds show.
 
     Raises:
         DiscoveryError: if no view shows so many points.
@@ -53,7 +55,7 @@ def simulate_views(
     reshaping, drawn = Reshaping(found, clouds), torch.Generator().manual_seed(int(generator.integers(2**31)))
     base = found.base.double().numpy()
     for rotation in rotations.double().numpy().swapaxes(0, 1):
-        objects = reshaping.draw(drawn) if reshape else reshaping.unchanged()
+        objects = reshaping.draw(drawn, limits) if reshape else reshaping.unchanged()
         oriented = zip(objects.points.double().numpy(), objects.normals.double().numpy(), strict=True)
         for i, surface in enumerate(oriented):
             turn = np.eye(4)

@@ -12,7 +12,8 @@
    labelled, they say which parts points are of, and where the category's shape is (`sliding_search`).
    Where simulated views taught, those that a view is most like decide which way round it is, and say with the
    posed shape which parts points are of (`view_search`); what slides is in the end where these points are
-   (`front_ends`), and where some objects are hinged elsewhere, either kind is tried (`other_hinges`).
+   (`front_ends`), and where some objects are hinged elsewhere, either kind is tried, and so are doors that are nearly
+   closed (`other_views`).
 4. *Decision* between two explanations of a cloud, where that was learnt (`decision`): the winner and its twin, which is
    registered, too, if the winner was, or the winner and its rival.
 5. *Side*, where some doors are hinged at another side than most: frames are turned so that what is seen looks right
@@ -52,7 +53,7 @@ from articulate_ssl.inference.hinge_sides import HingeSides
 from articulate_ssl.inference.hypothesis_registration import HypothesisRegistration
 from articulate_ssl.inference.object_frame import ObjectFrame
 from articulate_ssl.inference.options import InferenceOptions
-from articulate_ssl.inference.other_hinges import OtherHinges
+from articulate_ssl.inference.other_views import OtherViews
 from articulate_ssl.inference.packaging import as_prediction
 from articulate_ssl.inference.part_frames import PartFrames
 from articulate_ssl.inference.pose_network import PoseNetwork
@@ -100,6 +101,7 @@ class PoseEstimator(Proposals):
         states: Which joint states training clouds showed; a module owns it.
         pose_network: Which poses fits would say, if that was taught; a module owns it.
         box_turns: Which way round boxes with doors look right, if that was taught; a module owns it.
+        closed_views: Simulated views of doors that are nearly closed, if there were any; a module owns it.
     """
 
     def __init__(
@@ -124,6 +126,7 @@ class PoseEstimator(Proposals):
         self.front_ends = FrontEnds(articulated.num_parts - 1)
         self.pose_network = PoseNetwork(articulated.num_parts)
         self.box_turns = BoxTurns()
+        self.closed_views = ViewSearch(articulated.num_parts)
         super().__init__(articulated, rigid, iterations, replace(observation, camera=self.hinge_sides.camera))
         self.registration = HypothesisRegistration(inference, self.observation, self.states)
         self.decision = Decision(articulated, self.registration, self.two_ways)
@@ -136,7 +139,7 @@ class PoseEstimator(Proposals):
             self.object_frame,
             inference.proportions,
         )
-        self.other_hinges = OtherHinges(self.final, self.hinge_sides.camera)
+        self.other_views = OtherViews(self.final, self.hinge_sides.camera, self.closed_views)
         self.square_search = SquareSearch(self.final, self.hinge_sides, self.box_turns)
 
     @property
@@ -211,7 +214,7 @@ class PoseEstimator(Proposals):
             seen = [self.hinge_sides.counted_from_closed(one) for one in seen]
             seen[0], quarters = self.hinge_sides.decided(seen[0], dense)
             registers = (self.inference.refine if refine is None else refine) is not False
-            if fits and registers and not self.other_hinges.known:
+            if fits and registers and not self.other_views.lie:
                 seen[0] = self._as_most_are(seen[0], quarters, points, dense)
         if not self.handedness.learnt:
             return tuple(seen)
@@ -239,13 +242,14 @@ class PoseEstimator(Proposals):
         with torch.autocast(points.device.type, enabled=False):
             registers = (self.inference.refine if refine is None else refine) is not False
             self.square_search.measure()
+            self.other_views.measure()
             chosen, other, margin, votes = self._chosen(points, num_points, registers, dense)
             before = None
             if registers and fits:
                 before = self.final.distance(chosen, points)
                 chosen, other, margin = self.final.within_limits(chosen, other, margin, points, dense)
                 chosen, other, margin = self.square_search.sought(chosen, other, margin, points, dense)
-                chosen, other, margin, votes = self.other_hinges.sought(chosen, other, margin, votes, points, dense)
+                chosen, other, margin, votes = self.other_views.sought(chosen, other, margin, votes, points, dense)
                 if self.view_search.parts is not None and self.object_frame.learnt and dense is not None:
                     turn = (chosen.base[:, 0, :3, :3] @ self.object_frame.axes).mT
                     votes = self.view_search.parts.beside(votes, dense, turn)
@@ -468,7 +472,7 @@ class PoseEstimator(Proposals):
     ) -> tuple[Prediction, Tensor]:
         """Explanations in the clouds' proportions, packaged; and their errors [B] before that."""
         shown, rival, margin = self.final.within_limits(one, rival, margin, points, dense)
-        shown, _, margin, votes = self.other_hinges.sought(shown, rival, margin, votes, points, dense)
+        shown, _, margin, votes = self.other_views.sought(shown, rival, margin, votes, points, dense)
         return self._packaged(shown, points, margin, votes, dense), self.final.distance(one, points)
 
     def _packaged(

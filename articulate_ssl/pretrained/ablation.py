@@ -115,6 +115,7 @@ ABLATIONS = (
     ),
     Ablation("the network that says poses", lambda of: of.pose_network.learnt, _no_network_of_poses),
     Ablation("which way round boxes look right", lambda of: of.box_turns.learnt, _no_network_of_box_turns),
+    Ablation("views of closed doors", lambda of: of.closed_views.learnt, lambda of: of.closed_views.forget()),
     Ablation("fronts of drawers", lambda of: of.front_ends.learnt, lambda of: of.front_ends.forget()),
     Ablation(
         "how views are square, and these networks",

@@ -156,8 +156,14 @@ def make_data(card: WeightsCard, seed: int, place: Path, training_objects: int =
         raise CheckpointError(f"{place}: the data could not be made (exit code {code}); {log} says why")
 
 
-def data_of(card: WeightsCard, root: Path, num_points: int, samples: int | None = None) -> ArticulatedDataModule:
-    """Data as the card's are, in a folder that `render.generate` wrote to; test clouds are as many, or `samples`."""
+def data_of(
+    card: WeightsCard, root: Path, num_points: int, samples: int | None = None, scans: Path | None = None
+) -> ArticulatedDataModule:
+    """Data as the card's are, in a folder that `render.generate` wrote to; test clouds are as many, or `samples`.
+
+    Args:
+        scans: Folder of the set of complete clouds that taught views.
+    """
     return ArticulatedDataModule(
         card.category,
         root=str(root),
@@ -165,6 +171,7 @@ def data_of(card: WeightsCard, root: Path, num_points: int, samples: int | None 
         num_points=num_points,
         batch_size=_BATCH,
         max_test_samples=samples or card.metrics["samples"],
+        scans=None if scans is None else str(scans),
     )
 
 

@@ -30,6 +30,7 @@ from articulate_ssl.training.shipped_weights import WEIGHTS_FOLDER, ShippedWeigh
 from articulate_ssl.training.weights_card import CARD_SUFFIX, WeightsCard
 from articulate_ssl.training.weights_file import write_weights
 from datamodules.atomic import atomic_write
+from datamodules.manifest import set_folder
 
 # What a card says of its data beside the command, and which option that is.
 _TOLD = {"seed": "--seed", "train_instances": "--train-instances", "test_instances": "--test-instances"}
@@ -72,7 +73,7 @@ class Teaching:
         of = fingerprint(self.weights.file, card.data["command"])
         done = self._done(of)
         module = load_module(self._taught if done else self.weights.file)
-        data = data_of(card, root, module.num_points)
+        data = data_of(card, root, module.num_points, scans=self._make_scans(card, say))
         for lesson in (lesson for lesson in LESSONS if lesson in self.lessons and lesson not in done):
             say(f"{self.weights.name}: {lesson} …")
             with shown():
@@ -106,9 +107,19 @@ class Teaching:
     def _make_data(self, card: WeightsCard, say: Callable[[str], None]) -> Path:
         """As the card's command says."""
         name = "-".join(["data", *(word.strip("-") for word in self.data)])  # another set needs another folder
-        root, work = self._place / name, Workplace(self.weights.name, self._place)
-        words = shlex.split(card.data["command"])[1:]  # `python` is this one
-        stage = Stage("data", (sys.executable, *words, "--workers", "1", "--out", str(root)))
+        return self._made("data", card.data["command"], self._place / name, say)
+
+    def _make_scans(self, card: WeightsCard, say: Callable[[str], None]) -> Path | None:
+        """The complete clouds that taught views, in the folder of their set; None if none did."""
+        if "scans" not in card.data:
+            return None
+        root = self._made("scans", card.data["scans"], self._place / "scans", say)
+        return set_folder(root, card.category, "procedural", "complete", None)
+
+    def _made(self, name: str, command: str, root: Path, say: Callable[[str], None]) -> Path:
+        """A folder of data, once it holds what a command of the generator writes."""
+        work, words = Workplace(self.weights.name, self._place), shlex.split(command)[1:]  # `python` is this one
+        stage = Stage(name, (sys.executable, *words, "--workers", "1", "--out", str(root)))
         if work.seconds(stage) is None:
             work.run(stage, say)
         return root

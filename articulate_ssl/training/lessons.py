@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.training.box_lessons import learn_box_turns
+from articulate_ssl.training.closed_door_lesson import learn_closed_doors
 from articulate_ssl.training.explanations import learn_handedness, learn_two_ways
 from articulate_ssl.training.frame_lessons import learn_part_frames
 from articulate_ssl.training.hinge_lessons import learn_hinge_sides
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 # and again when it is known how faces lie: that moves states.
 LESSONS = (
     *("first_limits", "two_ways", "turns", "objects", "handedness", "part_frames", "view_turns", "hinge_sides"),
-    *("joint_limits", "poses", "box_turns", "standing_part", "confidence"),
+    *("joint_limits", "closed_doors", "poses", "box_turns", "standing_part", "confidence"),
 )
 
 
@@ -38,13 +39,15 @@ class Lesson(NamedTuple):
 
     Attributes:
         learn: What teaches it, `learn(module, clouds)`.
-        samples: Training clouds that it reads; 0 where it does not apply.
+        samples: Training clouds that it reads, or views that it simulates; 0 where it does not apply.
         of_objects: Whether it reads all clouds of objects, `learn(module, clouds, objects)`.
+        of_scans: Whether it reads what discovery did, `learn(module, training_clouds)`.
     """
 
     learn: Callable[..., None]
     samples: int
     of_objects: bool = False
+    of_scans: bool = False
 
 
 def teach(
@@ -64,7 +67,10 @@ def teach(
     taught = []
     for name in (name for name in LESSONS if name in lessons):
         lesson = plan(module)[name]
-        if lesson.samples:
+        if lesson.samples and lesson.of_scans:
+            lesson.learn(module, training_clouds)
+            taught.append(name)
+        elif lesson.samples:
             shown = training_clouds.objects if lesson.of_objects else lambda samples: (training_clouds.clouds(samples),)
             lesson.learn(module, *(some.to(module.device) for some in shown(lesson.samples)))
             taught.append(name)
@@ -80,6 +86,7 @@ def plan(module: ArticulatedPoseModule) -> dict[str, Lesson]:
     decides = refines and any_way and not module.sliding.learnt
     calibration, two_ways = module.calibration_samples, module.two_ways_samples
     labelled = len(module.sliding.labelled)  # clouds of the objects that discovery understood
+    doors = turns and refines and views and module.num_parts == 2
     limits = Lesson(learn_joint_limits, calibration if refines and turns else 0)
     return {
         "first_limits": limits,
@@ -91,6 +98,7 @@ def plan(module: ArticulatedPoseModule) -> dict[str, Lesson]:
         "view_turns": Lesson(learn_view_turns, two_ways if refines and views else 0),
         "hinge_sides": Lesson(learn_hinge_sides, module.hinge_sides_samples if refines else 0),
         "joint_limits": limits,
+        "closed_doors": Lesson(learn_closed_doors, module.closed_views_samples if doors else 0, of_scans=True),
         "poses": Lesson(learn_poses, module.pose_samples if refines and turns else 0),
         "box_turns": Lesson(learn_box_turns, module.box_turns_samples if refines and turns and any_way else 0),
         "standing_part": Lesson(learn_standing_part, 0 if any_way else calibration),

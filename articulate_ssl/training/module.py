@@ -99,6 +99,8 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
             than most (`inference.hinge_sides`); 0 learns nothing of it.
         pose_samples: Training clouds by whose registered predictions a network learns to say poses, where parts turn
             (`inference.pose_network`); half an hour, most of it to register them. 0 learns none.
+        closed_views_samples: Views of scans with doors nearly closed, which training does not show, that are sought,
+            too, where simulated views teach (`inference.other_views`); 0 simulates none.
         box_turns_samples: Training clouds of boxes with doors, in which these are closed, by which a network learns
             which way round boxes are (`inference.box_turns`); 15 minutes, most of it to register them. 0 learns none.
         orientation_range: How far objects are turned from their mean orientation at most, in degrees; 180 stands for
@@ -128,6 +130,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         part_frames_samples: int = 256,
         hinge_sides_samples: int = 2000,
         pose_samples: int = 1600,
+        closed_views_samples: int = 500,
         box_turns_samples: int = 640,
         orientation_range: float = 180.0,
     ) -> None:
@@ -149,6 +152,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         self.handedness_samples = handedness_samples
         self.part_frames_samples, self.hinge_sides_samples = part_frames_samples, hinge_sides_samples
         self.pose_samples, self.box_turns_samples = pose_samples, box_turns_samples
+        self.closed_views_samples = closed_views_samples
         require_at_least(self, **{name: 0 for name in options if name.endswith("_samples")})
 
         self.articulated = ArticulatedNetwork(network, num_parts, JOINT_TYPES[joint_type], state_bound=state_range)
@@ -164,6 +168,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         self.part_frames, self.common_shape = self.estimator.part_frames, self.estimator.common_shape
         self.object_frame, self.front_ends = self.estimator.object_frame, self.estimator.front_ends
         self.pose_network, self.box_turns = self.estimator.pose_network, self.estimator.box_turns
+        self.closed_views = self.estimator.closed_views
         self.recipe = recipe_type(self.estimator, objective, schedule, discovery)
         self.radius = RadiusStatistics()
         self.standing_part = StandingPart()
@@ -239,7 +244,7 @@ class ArticulatedPoseModule(LightningModule, HubWeights):
         shared = list(self.articulated.category.parameters())
         # What is learnt after the last step is not trained with the rest, nor when a run that ended goes on.
         taught = self.two_ways, self.hinge_sides, self.sliding, self.view_search, self.object_frame
-        taught += self.pose_network, self.box_turns
+        taught += self.pose_network, self.box_turns, self.closed_views
         elsewhere = set(map(id, (*shared, *(parameter for some in taught for parameter in some.parameters()))))
         others = [p for p in self.parameters() if id(p) not in elsewhere]
         optimizer = torch.optim.Adam(

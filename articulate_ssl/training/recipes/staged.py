@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import torch
 from torch import Tensor
 
 from articulate_ssl.discovery.discover import discover
-from articulate_ssl.discovery.from_scans import discover_from_scans
+from articulate_ssl.discovery.from_scans import StandingScans, discover_from_scans
 from articulate_ssl.discovery.grouped import discover_grouped
 from articulate_ssl.discovery.one_object.find import MIN_CLOUDS
 from articulate_ssl.discovery.parallel_axes import with_parallel_axes
@@ -74,6 +74,7 @@ class TrainingRecipe(Recipe):
         if self.discovery.grouped:
             _check_setting(self.estimator.observation)
         self.found: HandOver | None = None
+        self._scans: StandingScans | None = None
         self.group = rotation_group(len(self.estimator.articulated.pose_head.elements))
 
     @property
@@ -129,10 +130,19 @@ class TrainingRecipe(Recipe):
         if self._simulated:
             scans = data.scans(options.clouds), *objects
             found_in = (*scans, *category, observation.orientation, num_points)
-            return discover_from_scans(clouds, *found_in, to_stand=quarters_to_stand)
+            *simulated, scans = discover_from_scans(clouds, *found_in, to_stand=quarters_to_stand)
+            self._scans = replace(scans, found=scans.found.in_the_trees_order())
+            return tuple(simulated)
         if options.grouped:
             return clouds, discover_grouped(clouds, *objects, *category)
         return clouds, discover(clouds, *category, observation)
+
+    def standing_scans(self, data: TrainingClouds, num_points: int) -> StandingScans:
+        """Scans that taught views, as discovery stood them up; found anew where that was in another run."""
+        if self._scans is None:
+            with torch.random.fork_rng(devices=[]):
+                self._discovered(data, num_points)
+        return self._scans
 
     def step(self, points: Tensor, step: int, generator: Callable[[], torch.Generator]) -> Outcome:
         """Warm-up or self-supervision."""

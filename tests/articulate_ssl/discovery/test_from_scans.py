@@ -40,7 +40,7 @@ def test_views_that_teach_are_turned_as_the_views_are(monkeypatch, degrees):
     options, instance = DiscoveryOptions(grouped=True), torch.zeros(16, dtype=torch.long)
     orientation = OrientationRange(degrees)
     arguments = (views, data.points, data.points, instance, 2, LAPTOP[4], options, orientation, POINTS)
-    points, found = discover_from_scans(*arguments, to_stand=_all_stand)
+    points, found, _ = discover_from_scans(*arguments, to_stand=_all_stand)
     assert asked == [arguments[1:7]]
     assert 11 * from_scans._VIEWS < len(points) <= 12 * from_scans._VIEWS  # of three quarters of the clouds
     assert orientation.contains(found.base[:, :3, :3]).all()
@@ -77,7 +77,7 @@ def test_what_lies_is_seen_as_it_stands_and_said_to_lie(monkeypatch):
     monkeypatch.setattr(from_scans, "discover_grouped", lambda *_: truth)
     options, orientation = DiscoveryOptions(grouped=True), OrientationRange(100.0)
     arguments = (views, data.points, data.points, torch.zeros(16, dtype=torch.long), 2, LAPTOP[4], options)
-    points, found = discover_from_scans(*arguments, orientation, POINTS, to_stand=to_stand)
+    points, found, _ = discover_from_scans(*arguments, orientation, POINTS, to_stand=to_stand)
     assert asked == [list(range(12))]
     turn, _ = roma.rigid_points_registration(truth.shape.points, found.shape.points / found.shape.points.norm())
     # Errors say which cloud a view is of: those of 3 and 15 are 3 and 15 times its scale.

@@ -180,8 +180,8 @@ def test_where_views_show_either_kind_turned_frames_stay(monkeypatch, known):
     points = torch.rand(2, POINTS, 3, generator=torch.Generator().manual_seed(0))
     estimator.hinge_sides.learnt.fill_(True)
     estimator.hinge_sides.camera.learnt.fill_(True)
-    monkeypatch.setattr(type(estimator.other_hinges), "known", known)
-    monkeypatch.setattr(estimator.other_hinges, "sought", lambda *of: of[:4])
+    monkeypatch.setattr(type(estimator.other_views), "lie", known)
+    monkeypatch.setattr(estimator.other_views, "sought", lambda *of: of[:4])
     asked = []
     monkeypatch.setattr(estimator, "_as_most_are", lambda one, *_: (asked.append(one), one)[1])
     estimator.predict(points, POINTS, dense=points)

@@ -208,7 +208,7 @@ def test_what_is_hinged_otherwise_is_sought_among_its_own_views_and_believed_whe
     points = data.points[:, :256]
     views = estimator.view_search
     views.load_state_dict(learnt.state_dict())
-    assert not estimator.other_hinges.known  # of no view it is known that it lies
+    assert not estimator.other_views.lie  # of no view it is known that it lies
     views.quarters = torch.arange(300) % 2
     shown, search = [], views.search
     monkeypatch.setattr(views, "search", lambda points, **of: (shown.append(of["shown"]), search(points, **of))[1])
@@ -221,7 +221,7 @@ def test_what_is_hinged_otherwise_is_sought_among_its_own_views_and_believed_whe
     one = estimator.final.in_proportion(one, points, data.points)
     votes = search(points).votes
     votes = votes._replace(share=torch.full_like(votes.share, 0.5))
-    sought = estimator.other_hinges.sought
+    sought = estimator.other_views.sought
     found, rival, margin, said = sought(one, one, torch.full((3,), 2.0), votes, points, data.points)
     if not known:
         assert found is one and said is votes and not shown
@@ -250,7 +250,7 @@ def test_what_is_hinged_otherwise_and_fits_worse_is_a_rival_if_none_is_nearer(le
     one = estimator.articulated.category_at(data.base[:, None], data.state[:, None])
     one = estimator.final.in_proportion(one, points, data.points)
     margin = torch.tensor([1.0, 1.0, 1e-4])
-    found, rival, said, _ = estimator.other_hinges.sought(one, one, margin, learnt.search(points).votes, points, None)
+    found, rival, said, _ = estimator.other_views.sought(one, one, margin, learnt.search(points).votes, points, None)
     assert _degrees(found.base[:, 0, :3, :3], data.base[:, :3, :3]).max() < 20
     assert _degrees(rival.base[:2, 0, :3, :3], data.base[:2, :3, :3]).min() > 90
     torch.testing.assert_close(rival.base[2], one.base[2])

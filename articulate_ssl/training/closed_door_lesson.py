@@ -1,0 +1,69 @@
+"""Views of closed doors, of which training showed none: doors are closed in scans, and cameras simulated before them.
+
+No label is read. Discovery has found parts and hinges in scans of open doors, and simulates views of them, in other
+proportions and joint states, which teach the network. Faces say at which state a door is closed, so there are views of
+states from there to where training begins, as well. They are kept apart (`inference.other_views`): a network that is
+taught by closed doors, too, explains open ones worse (docs/experiments.md, step 266).
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from articulate_ssl.inference.hinge_sides import closed_state
+from articulate_ssl.ops.progress import tell
+from articulate_ssl.shape.articulated_shape import ArticulatedShape
+from articulate_ssl.training.set_clouds import SetClouds
+
+if TYPE_CHECKING:
+    from articulate_ssl.training.module import ArticulatedPoseModule
+
+# Of the width of a joint's range as seen: what is closed nearer to it is seen. Chosen.
+_SEEN = 0.15
+# Degrees and length by which hinges differ at most, of a shape and of what discovery found once more. Chosen: a network
+# moves them by about one degree and a hundredth.
+_ANGLE, _APART = 10.0, 0.1
+
+log = logging.getLogger(__name__)
+
+
+@torch.no_grad()
+def learn_closed_doors(
+    module: ArticulatedPoseModule,
+    data: SetClouds,
+) -> None:
+    """Keep simulated views of doors between closed and as training shows them, where faces say what closed is."""
+    estimator, states = module.estimator, module.states
+    estimator.closed_views.forget()
+    frames, shape = module.part_frames, module.articulated.category.articulated_shape(module.articulated.joint_type)
+    if not frames.flat.all():
+        tell(log, "closed doors: faces do not say at which state they are")
+        return
+    closed = closed_state(shape, states.known, frames)
+    states.set_rest(closed)
+    if states.showed(states.rest, _SEEN):
+        tell(log, "closed doors: training shows them")
+        return
+    scans = module.recipe.standing_scans(data, module.num_points)
+    if not _same_hinge(scans.found.shape, shape):
+        log.warning("closed doors: discovery found the hinge elsewhere than it is now: there are no views of them")
+        return
+    known = states.known[0].tolist()
+    limits = torch.tensor([sorted((closed, min(known, key=lambda end: abs(end - closed))))])
+    count = math.ceil(module.closed_views_samples / len(scans.clouds))
+    views, found = scans.views(module.num_points, np.random.default_rng(0), count, limits)
+    estimator.closed_views.learn(views, found.base, found.state, found.point_part, found.quarters)
+    tell(log, "closed doors: %d views of doors at %.0f to %.0f degrees", len(views), *limits[0].rad2deg().tolist())
+
+
+def _same_hinge(one: ArticulatedShape, other: ArticulatedShape) -> bool:
+    """Whether two shapes in canonical space have about the same joint, in the same sense."""
+    axis, pivot = other.joints.axis[0].to(one.points), other.joints.pivot[0].to(one.points)
+    cosine = one.joints.axis[0] @ axis
+    between = torch.linalg.cross(one.joints.pivot[0] - pivot, axis).norm()
+    return bool(cosine > math.cos(math.radians(_ANGLE)) and between < _APART)
