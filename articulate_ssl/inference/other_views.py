@@ -7,7 +7,7 @@ are right then (docs/experiments.md, step 246). So both are always sought, where
 Training shows doors that are open, and users scan closed ones, which no view was like: another side of a box was taken
 for an open door. But scans show whole objects, and a door whose hinge is known can be closed in them before they are
 seen by a camera (`training/closed_door_lesson.py`). Such views are sought, too, apart from the others, which stay as
-they were (docs/experiments.md, step 279).
+they were, and are believed where they explain a cloud clearly better (docs/experiments.md, step 279).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Iterator
 
 from torch import Tensor
 
-from articulate_ssl.inference.contest import Contest
+from articulate_ssl.inference.contest import CLEARLY, Contest
 from articulate_ssl.inference.final_fit import FinalFit
 from articulate_ssl.inference.hinge_sides import closed_state
 from articulate_ssl.inference.upright_camera import UprightCamera
@@ -69,7 +69,8 @@ class OtherViews:
             likely = final.registration.states.contains(tried.state[:, 0])
             if lying is not None:
                 likely &= (self.camera.stood(tried.base[:, 0, :3, :3])[1] > 0) == lying
-            contest, rows = contest.against(tried, final.distance(tried, points), likely)
+            least = CLEARLY if views is self.closed else 1.0
+            contest, rows = contest.against(tried, final.distance(tried, points), likely, least)
             votes = votes._replace(share=votes.share.index_copy(0, rows, seen.votes.share[rows]))
         return contest.one, contest.rival, contest.margin, votes
 

@@ -32,7 +32,7 @@ from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import se3
 from articulate_ssl.inference.box_turns import BoxTurns, Looks
 from articulate_ssl.inference.candidates import ANOTHER_WAY, angle_to
-from articulate_ssl.inference.contest import Contest
+from articulate_ssl.inference.contest import CLEARLY, Contest
 from articulate_ssl.inference.final_fit import FinalFit
 from articulate_ssl.inference.hinge_sides import HingeSides, closed_state
 from articulate_ssl.inference.state_range import StateRange
@@ -43,8 +43,6 @@ _UNSURE = 0.5  # margins below
 _TRIED = 6  # that take proportions; the truth is among the first five of most
 _STRETCHED = 1.6  # at most, or its inverse
 _POINTS, _SCALES, _ROUNDS = 128, (0.06, 0.03), 4  # of the registration
-# Its error has to be below this share of that of what training showed: others explain a few of those by 4 % less.
-_CLEARLY = 0.95
 # Of the width of a joint's range, beyond it: registration, before proportions, is as far off. Chosen.
 _REGISTERED = 0.15
 _AT_ONCE = 4  # clouds whose explanations take proportions: on a CPU, of one alone that takes three times as long
@@ -98,13 +96,13 @@ class _Squares(NamedTuple):
         base, state = torch.cat([self.base] * 2, dim=1), torch.cat([self.state, closed], dim=1)
         allowed = right & (most | states.showed(self.state, _REGISTERED))
         allowed, shown = torch.cat([allowed, right & most], dim=1), torch.cat([~most] * 2, dim=1)
-        then = torch.full_like(order, _CLEARLY)
+        then = torch.full_like(order, CLEARLY)
         then = torch.cat([then, torch.where(order < 0, then, 1.0)], dim=1)
         order = torch.cat([order] * 2, dim=1).masked_fill(~allowed, -torch.inf)
         order = order.argsort(dim=1, descending=True, stable=True)
         rows = torch.arange(len(order), device=order.device)[:, None]
         # Where doors stand as training showed, fits that are clearly better are believed; where not, looks are.
-        against = torch.where(alike | ~self.unseen, 1 / _CLEARLY, torch.inf)
+        against = torch.where(alike | ~self.unseen, 1 / CLEARLY, torch.inf)
         believed = alike & ~(self.unseen & (rank < 0))
         return _Squares(
             base[rows, order],
@@ -184,7 +182,7 @@ class SquareSearch:
         base, state = self._square(points, frames)
         showed = self.final.registration.states.showed(one.state[:, 0])
         another = angle_to(one.base[..., :3, :3], base[:, 0, :3, :3])[:, 0] > ANOTHER_WAY
-        every, least = torch.ones_like(state[..., 0], dtype=torch.bool), torch.where(showed, _CLEARLY, 1.0)
+        every, least = torch.ones_like(state[..., 0], dtype=torch.bool), torch.where(showed, CLEARLY, 1.0)
         asked = ~showed | another | (margin < _UNSURE)
         return _Squares(base, state, every, ~every, ~showed, asked, least, every.to(least))
 

@@ -40,8 +40,15 @@ def test_views_that_teach_are_turned_as_the_views_are(monkeypatch, degrees):
     options, instance = DiscoveryOptions(grouped=True), torch.zeros(16, dtype=torch.long)
     orientation = OrientationRange(degrees)
     arguments = (views, data.points, data.points, instance, 2, LAPTOP[4], options, orientation, POINTS)
-    points, found, _ = discover_from_scans(*arguments, to_stand=_all_stand)
+    points, found, scans = discover_from_scans(*arguments, to_stand=_all_stand)
     assert asked == [arguments[1:7]]
+    # Of the same scans, fewer views, of other joint states, turned as the first of each were.
+    limits = truth.limits() + 1.0
+    fewer, others = scans.views(POINTS, np.random.default_rng(0), 2, limits)
+    assert len(scans.clouds) == 12 and 12 < len(fewer) <= 24
+    assert (others.state > limits[:, 0]).all() and (others.state < limits[:, 1]).all()
+    between = roma.rotmat_geodesic_distance(others.base[:, None, :3, :3], scans.turns[:, :2].flatten(0, 1)[None])
+    assert between.amin(dim=1).max() < 1e-2
     assert 11 * from_scans._VIEWS < len(points) <= 12 * from_scans._VIEWS  # of three quarters of the clouds
     assert orientation.contains(found.base[:, :3, :3]).all()
     larger = found.log_stretch[:, 0, 0].exp()

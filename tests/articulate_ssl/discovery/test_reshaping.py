@@ -93,6 +93,13 @@ def test_draws_are_repeatable_and_within_what_the_clouds_show():
     assert (size[0] / size[1]).log().abs().amax() < 1  # nothing flies apart
 
 
+def test_draws_are_between_limits_where_these_are_given():
+    points, found = _registered(OVEN)
+    limits = found.limits() + 3.0
+    drawn = Reshaping(found, points).draw(torch.Generator().manual_seed(0), limits)
+    assert (drawn.state > limits[:, 0]).all() and (drawn.state < limits[:, 1]).all()
+
+
 def test_points_of_what_lies_beside_its_slide_are_told_by_where_it_lies():
     """A drawer as high as its body, but for a fifth of the chest's size farther up than the template's."""
     points, found = _registered(DRAWER)

@@ -10,6 +10,8 @@ from articulate_ssl.geometry.orientation_range import OrientationRange
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import se3, transform_points
 from articulate_ssl.inference import view_search
+from articulate_ssl.inference.contest import CLEARLY
+from articulate_ssl.inference.hinge_sides import closed_state
 from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.inference.pose_estimation import PoseEstimator
 from articulate_ssl.inference.upright_camera import UprightCamera
@@ -257,3 +259,51 @@ def test_what_is_hinged_otherwise_and_fits_worse_is_a_rival_if_none_is_nearer(le
     error, other = (estimator.final.distance(this, points) for this in (found, rival))
     torch.testing.assert_close(said[:2], 1 - error[:2] / other[:2])
     assert (said[:2] > 0.02).all() and said[2] == 1e-4
+
+
+@torch.no_grad()
+def test_closed_doors_are_sought_among_their_own_views_and_believed_where_they_fit_clearly_better(learnt, estimator):
+    """Of three clouds two are explained the wrong way round, the third rightly; nobody knows which way is up."""
+    data = _views(3, seed=8)
+    points = data.points[:, :256]
+    base = data.base.clone()
+    base[:2, :3, :3] = base[:2, :3, :3] @ OVER
+    one = estimator.articulated.category_at(base[:, None], data.state[:, None])
+    one = estimator.final.in_proportion(one, points, data.points)
+    given = one, one, torch.full((3,), 2.0), learnt.search(points).votes, points, data.points
+    estimator.hinge_sides.camera.learnt.fill_(False)
+    assert estimator.other_views.sought(*given)[0] is one
+    estimator.closed_views.load_state_dict(learnt.state_dict())
+    try:
+        found, rival, margin, _ = estimator.other_views.sought(*given)
+        error, before = (estimator.final.distance(this, points) for this in (found, one))
+        assert _degrees(found.base[:, 0, :3, :3], data.base[:, :3, :3]).max() < 20
+        assert (error[:2] < CLEARLY * before[:2]).all()
+        torch.testing.assert_close(rival.base[:2], one.base[:2])
+        torch.testing.assert_close(margin[:2], 1 - error[:2] / before[:2])
+        # What fits about as well stays as it was.
+        torch.testing.assert_close(found.base[2], one.base[2])
+        # A door that is open as no joint can be is no explanation.
+        estimator.states.seen.copy_(torch.tensor([[8.0, 9.0]]))
+        estimator.states.set_rest(8.5)
+        torch.testing.assert_close(estimator.other_views.sought(*given)[0].base, one.base)
+    finally:
+        estimator.closed_views.forget()
+        estimator.states.forget()
+
+
+@torch.no_grad()
+def test_where_closed_doors_were_seen_it_is_known_at_which_state_they_are(learnt, estimator):
+    """Weights whose joint limits were learnt anew find it out again."""
+    estimator.states.seen.copy_(torch.tensor([[-1.0, 0.5]]))
+    try:
+        estimator.other_views.measure()
+        assert not estimator.states.rests
+        estimator.closed_views.load_state_dict(learnt.state_dict())
+        estimator.other_views.measure()
+        shape = estimator.articulated.category.articulated_shape(REVOLUTE)
+        closed = closed_state(shape, estimator.states.known, estimator.part_frames)
+        assert estimator.states.rests and float(estimator.states.rest) == pytest.approx(closed)
+    finally:
+        estimator.closed_views.forget()
+        estimator.states.forget()

@@ -2,6 +2,7 @@
 
 import json
 import shlex
+from dataclasses import replace
 
 import pytest
 from packable import made_up_metrics, shipped_in, trained
@@ -102,3 +103,20 @@ def test_other_data_take_the_place_of_the_cards(shipped, tmp_path, made, learnt)
     assert learnt == ["confidence"] * 2  # nothing that other clouds taught is taken for taught
     with pytest.raises(CheckpointError, match="--states: options of the generator come with a value each"):
         Teaching(shipped, ("confidence",), build, out, ("--states",))
+
+
+def test_scans_that_taught_views_are_made_as_the_card_says_and_are_at_hand(shipped, tmp_path, made, monkeypatch):
+    file = shipped.file.with_suffix(".json")
+    card = WeightsCard.load(file)
+    scans = "python -m render.generate --category laptop --seed 10 --states 9"
+    replace(card, data=card.data | {"scans": scans}).save(file)
+    given = []
+    monkeypatch.setattr(teach, "teach", lambda module, clouds, some: given.append(clouds.data.hparams.scans))
+    Teaching(shipped, ("closed_doors",), tmp_path / "build", tmp_path / "out").run(print)
+    assert [command.split(" --workers", 1)[0].split(" -m ", 1)[1] for command in made] == [
+        COMMAND.split(" -m ", 1)[1],
+        scans.split(" -m ", 1)[1],
+    ]
+    place = tmp_path / "build" / "laptop-complete"
+    assert given == [str(place / "scans" / "laptop" / "procedural-complete")]
+    assert (place / "scans" / "laptop" / "procedural-complete" / "manifest.json").is_file()

@@ -10,6 +10,7 @@ from tiny import DISCOVERY, POINTS, fit, quiet_trainer, tiny_data, tiny_module
 from torch.nn import functional
 from unlabelled import without_labels
 
+from articulate_ssl.discovery.from_scans import StandingScans
 from articulate_ssl.discovery.registered_shape import RegisteredShape
 from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.geometry.screw import REVOLUTE
@@ -18,6 +19,7 @@ from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.joints import Joints
 from articulate_ssl.training.lying_scans import quarters_to_stand
 from articulate_ssl.training.recipes import staged
+from articulate_ssl.training.set_clouds import SetClouds
 from datamodules.manifest import ManifestError
 
 GROUPED = replace(DISCOVERY, clouds=18, grouped=True)
@@ -120,8 +122,9 @@ def test_views_are_taught_by_scans_of_the_category(tmp_path, monkeypatch):
     def from_scans(views, clouds, objects, instance, *rest, to_stand):
         assert to_stand is quarters_to_stand
         given["all"] = views, clouds, objects, instance
-        given["rest"] = rest
-        return clouds[:4, :POINTS], replace(_some_shape(clouds[:4]), point_part=parts)
+        given["rest"], given["times"] = rest, given.get("times", 0) + 1
+        standing = StandingScans(clouds, _some_shape(clouds), torch.eye(3).expand(len(clouds), 3, 3, 3), 0.3)
+        return clouds[:4, :POINTS], replace(_some_shape(clouds[:4]), point_part=parts), standing
 
     parts = torch.randint(2, (4, POINTS), generator=torch.Generator().manual_seed(0))
     monkeypatch.setattr(staged, "discover_from_scans", from_scans)
@@ -150,6 +153,10 @@ def test_views_are_taught_by_scans_of_the_category(tmp_path, monkeypatch):
     again = tiny_module(discovery=GROUPED, objective=VIEWS, orientation_range=100.0)
     again.recipe.restore(module.recipe.kept())
     assert torch.equal(again.recipe.found.point_part, parts)
+    # Scans stay at hand; a checkpoint does not keep them, so another run finds them anew.
+    data = SetClouds(tiny_data(tmp_path / "views", view="partial", protocol="honest", scans=str(scans)))
+    assert torch.equal(module.recipe.standing_scans(data, POINTS).clouds, clouds) and given["times"] == 1
+    assert torch.equal(again.recipe.standing_scans(data, POINTS).clouds, clouds) and given["times"] == 2
 
 
 def test_scans_of_another_category_or_view_are_refused(tmp_path):
