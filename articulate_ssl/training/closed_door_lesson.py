@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 # Of the width of a joint's range as seen: what is closed nearer to it is seen. Chosen.
 _SEEN = 0.15
-# Degrees and length by which hinges differ at most, of a shape and of what discovery found once more. Chosen: a network
-# moves them by about one degree and a hundredth.
+# Degrees and length by which hinges differ at most, of a shape and of what discovery found, or found once more. Chosen:
+# training moves them by about one degree and a hundredth; other code may turn canonical space another way.
 _ANGLE, _APART = 10.0, 0.1
 
 log = logging.getLogger(__name__)
@@ -50,13 +50,13 @@ def learn_closed_doors(
         tell(log, "closed doors: training shows them")
         return
     scans = module.recipe.standing_scans(data, module.num_points)
-    if not _same_hinge(scans.found.shape, shape):
-        log.warning("closed doors: discovery found the hinge elsewhere than it is now: there are no views of them")
-        return
     known = states.known[0].tolist()
     limits = torch.tensor([sorted((closed, min(known, key=lambda end: abs(end - closed))))])
     count = math.ceil(module.closed_views_samples / len(scans.clouds))
     views, found = scans.views(module.num_points, np.random.default_rng(0), count, limits)
+    if not _same_hinge(found.shape, shape):  # as large as in views, as the category's is
+        log.warning("closed doors: discovery found the hinge elsewhere than it is now: there are no views of them")
+        return
     estimator.closed_views.learn(views, found.base, found.state, found.point_part, found.quarters)
     tell(log, "closed doors: %d views of doors at %.0f to %.0f degrees", len(views), *limits[0].rad2deg().tolist())
 
