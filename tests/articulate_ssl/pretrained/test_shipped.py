@@ -11,7 +11,7 @@ from articulate_ssl.training.checkpoint import load_module
 from articulate_ssl.training.shipped_weights import WEIGHTS_FOLDER, shipped_weights
 from articulate_ssl.training.weights_card import CARD_SUFFIX, HEADLINES, VIEWS, WeightsCard
 
-MAX_BYTES = 26_000_000  # in the wheel, which deflates them; 25 until ovens and washing machines had a network more
+MAX_BYTES = 27_000_000  # in the wheel, which deflates them; 26 until views of closed doors were kept
 ROOT = Path(__file__).parents[3]
 
 
