@@ -59,9 +59,11 @@ class OtherViews:
         dense: Tensor | None,  # [B, P, 3]
     ) -> tuple[Hypotheses, Hypotheses, Tensor, Votes | None]:  # H = 1, H = 1, [B]
         """Explanations, or what views of each kind say by themselves, where that fits better (`contest`)."""
-        final = self.final
+        final, kinds = self.final, tuple(self._kinds())
+        if not kinds:
+            return one, rival, margin, votes
         contest = Contest(one, rival, margin, final.distance(one, points))
-        for views, lying, shown in self._kinds():
+        for views, lying, shown in kinds:
             seen = views.search(points, shown=shown)
             start = final.articulated.category_at(seen.base[:, :1], seen.state[:, :1])
             tried, _ = final.registration.registered(start, points)

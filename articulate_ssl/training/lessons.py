@@ -67,13 +67,14 @@ def teach(
     taught = []
     for name in (name for name in LESSONS if name in lessons):
         lesson = plan(module)[name]
-        if lesson.samples and lesson.of_scans:
+        if not lesson.samples:
+            continue
+        if lesson.of_scans:
             lesson.learn(module, training_clouds)
-            taught.append(name)
-        elif lesson.samples:
+        else:
             shown = training_clouds.objects if lesson.of_objects else lambda samples: (training_clouds.clouds(samples),)
             lesson.learn(module, *(some.to(module.device) for some in shown(lesson.samples)))
-            taught.append(name)
+        taught.append(name)
     module.train(training)
     return tuple(taught)
 
