@@ -18,6 +18,7 @@ from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.inference.candidates import Candidates
 from articulate_ssl.inference.common_shape import CommonShape
+from articulate_ssl.inference.hinge_sides import closed_state
 from articulate_ssl.inference.hypothesis_registration import HypothesisRegistration
 from articulate_ssl.inference.object_frame import ObjectFrame
 from articulate_ssl.inference.part_frames import FARTHEST, PartFrames
@@ -141,6 +142,13 @@ class FinalFit:
                 rival = rival.with_rows(out[better], before.rows(better))
                 margin = margin.index_fill(0, out[better], 0.0)
         return fitted, rival, margin
+
+    def measure_closed(self) -> None:
+        """Find out at which joint state the door is closed, unless that is known."""
+        states = self.registration.states
+        if not states.rests:
+            shape = self.articulated.category.articulated_shape(self.articulated.joint_type)
+            states.set_rest(closed_state(shape, states.known, self.part_frames))
 
     def distance(
         self,

@@ -18,7 +18,6 @@ from torch import Tensor
 
 from articulate_ssl.inference.contest import CLEARLY, Contest
 from articulate_ssl.inference.final_fit import FinalFit
-from articulate_ssl.inference.hinge_sides import closed_state
 from articulate_ssl.inference.upright_camera import UprightCamera
 from articulate_ssl.inference.view_search import ViewSearch
 from articulate_ssl.inference.votes import Votes
@@ -43,11 +42,9 @@ class OtherViews:
         return bool(self.camera.learnt) and bool(self.final.view_search.quarters.any())
 
     def measure(self) -> None:
-        """Find out at which joint state a door is closed, unless that is known, or nothing is said of it."""
-        states, final = self.final.registration.states, self.final
-        if self.closed.learnt and not states.rests:
-            shape = final.articulated.category.articulated_shape(final.articulated.joint_type)
-            states.set_rest(closed_state(shape, states.known, final.part_frames))
+        """Find out at which joint state the door is closed, where views show that (`FinalFit.measure_closed`)."""
+        if self.closed.learnt:
+            self.final.measure_closed()
 
     def sought(
         self,

@@ -34,7 +34,7 @@ from articulate_ssl.inference.box_turns import BoxTurns, Looks
 from articulate_ssl.inference.candidates import ANOTHER_WAY, angle_to
 from articulate_ssl.inference.contest import CLEARLY, Contest
 from articulate_ssl.inference.final_fit import FinalFit
-from articulate_ssl.inference.hinge_sides import HingeSides, closed_state
+from articulate_ssl.inference.hinge_sides import HingeSides
 from articulate_ssl.inference.state_range import StateRange
 from articulate_ssl.network.hypotheses import Hypotheses
 
@@ -143,11 +143,9 @@ class SquareSearch:
         return bool(extent.min() > _THICK * extent.max())
 
     def measure(self) -> None:
-        """Find out at which joint state the door is closed, unless that is known."""
-        states, final = self.final.registration.states, self.final
-        if not states.rests and self.known:
-            shape = final.articulated.category.articulated_shape(REVOLUTE)
-            states.set_rest(closed_state(shape, states.known, final.part_frames))
+        """Find out at which joint state the door is closed (`FinalFit.measure_closed`), where there is one."""
+        if self.known:
+            self.final.measure_closed()
 
     def sought(
         self,

@@ -45,8 +45,7 @@ def learn_closed_doors(
         tell(log, "closed doors: faces do not say at which state they are")
         return
     closed = closed_state(shape, states.known, frames)
-    states.set_rest(closed)
-    if states.showed(states.rest, _SEEN):
+    if states.showed(states.rest.new_tensor([closed]), _SEEN):
         tell(log, "closed doors: training shows them")
         return
     scans = module.recipe.standing_scans(data, module.num_points)
@@ -57,6 +56,7 @@ def learn_closed_doors(
     if not _same_hinge(found.shape, shape):  # as large as in views, as the category's is
         log.warning("closed doors: discovery found the hinge elsewhere than it is now: there are no views of them")
         return
+    states.set_rest(closed)
     estimator.closed_views.learn(views, found.base, found.state, found.point_part, found.quarters)
     tell(log, "closed doors: %d views of doors at %.0f to %.0f degrees", len(views), *limits[0].rad2deg().tolist())
 

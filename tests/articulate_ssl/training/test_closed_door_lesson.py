@@ -89,6 +89,7 @@ def test_doors_that_training_shows_closed_need_no_views(module, least):
     module.states.seen.copy_(torch.tensor([[least, least + 1.0]]))
     learn_closed_doors(module, None)
     assert not module.estimator.closed_views.learnt and not module.asked
+    assert not module.states.rests  # limits stay as they are
 
 
 @pytest.mark.parametrize("what", ["axis", "pivot"])
@@ -101,3 +102,4 @@ def test_scans_whose_hinge_is_elsewhere_than_the_categorys_teach_nothing(module,
     module.recipe.standing_scans = lambda *_: scans
     learn_closed_doors(module, None)
     assert not module.estimator.closed_views.learnt and "found the hinge elsewhere" in caplog.text
+    assert not module.states.rests
