@@ -30,7 +30,8 @@ from articulate_ssl.training.callbacks.duration import EstimateDuration
 from articulate_ssl.training.callbacks.keep_last import KeepLast
 from articulate_ssl.training.callbacks.show_progress import ShowProgress
 from articulate_ssl.training.callbacks.test_results import SendTestResults
-from articulate_ssl.training.module import JOINT_TYPES, ArticulatedPoseModule
+from articulate_ssl.training.model import JOINT_TYPES, ArticulatedPoseModel
+from articulate_ssl.training.module import ArticulatedPoseModule
 from datamodules.articulated_data_module import ArticulatedDataModule
 
 IGNORED_WARNINGS = (
@@ -46,7 +47,7 @@ TERMINATED = 128 + signal.SIGTERM  # the exit code, as a shell has it
 _CHECKPOINT_STEPS = 200  # between checkpoints
 # Options of the model without which weights do not fit, or mean something else, and their defaults.
 _OF_WEIGHTS = {
-    name: signature(ArticulatedPoseModule).parameters[name].default
+    name: signature(ArticulatedPoseModel).parameters[name].default
     for name in ("num_parts", "joint_type", "state_range", "recipe", "orientation_range")
 }
 

@@ -30,6 +30,7 @@ from articulate_ssl.training.shipped_weights import shipped_weights
 from articulate_ssl.training.weights_card import VIEWS, WeightsCard
 
 if TYPE_CHECKING:
+    import numpy as np
     import torch
 
     from articulate_ssl.inference.scan_prediction import ScanPrediction
@@ -114,43 +115,54 @@ def run(arguments: list[str]) -> int:
     if args.check and args.formats is not None and not set(MODELS) & set(args.formats):
         parser.error(f"--check reads {' or '.join(MODELS)}: name one in --formats, or leave --formats out")
     out = args.out or Path(f"{args.cloud.stem}-prediction")
-    from articulate_ssl.inference.device import DeviceError, usable_device
-    from articulate_ssl.inference.export.physics_check import PhysicsCheckError
-    from articulate_ssl.ops.denormals import flush_denormals
     from datamodules.point_cloud_io import PointCloudError
 
     try:
-        device = usable_device(args.device)
-    except DeviceError as error:
-        parser.error(f"--device {error}")
-    try:
         demand_folder(out)
-        with flush_denormals():
-            candidates, chosen = _predict(args, device)
+        # First: what is wrong with it is said before networks are imported, which takes seconds.
+        cloud = _scan(args)
+        candidates, chosen = _predict(args, cloud, _device(args, parser))
         files = _write(candidates[0], out, args)
         _print_summary(candidates, files, chosen)
         if args.check:
             _print_check(out, files, args.metres_per_unit)
-    except (PointCloudError, CheckpointError, ExportError, PhysicsCheckError, OSError) as error:
+    except (PointCloudError, CheckpointError, ExportError, OSError) as error:
         print(f"articulate-ssl predict: {error}", file=sys.stderr)
         return BAD_INPUT
     return 0
 
 
-def _predict(args: argparse.Namespace, device: torch.device) -> tuple[list[ScanPrediction], ArticulatedPoseEstimator]:
-    """What every set of weights that is asked says, best first, and the best one's estimator."""
-    from articulate_ssl.pretrained.estimator import load
-    from articulate_ssl.pretrained.ranking import ranked
+def _scan(args: argparse.Namespace) -> np.ndarray:  # [N, 3]
     from datamodules.point_cloud_io import load_point_cloud
     from datamodules.standing_object import load_standing_object
 
-    cloud = load_standing_object(args.cloud) if args.on_table else load_point_cloud(args.cloud)
-    estimator = load(args.category or args.ckpt, None if args.view == AUTO else args.view, device)
-    several = len(estimator.estimators) > 1
-    progress = track(
-        estimator.estimators, "trying weights", console=Console(stderr=True), disable=not several, transient=True
-    )
-    candidates = ranked([one.predict(cloud, args.refine) for one in progress])
+    return load_standing_object(args.cloud) if args.on_table else load_point_cloud(args.cloud)
+
+
+def _device(args: argparse.Namespace, parser: argparse.ArgumentParser) -> torch.device:
+    from articulate_ssl.inference.device import DeviceError, usable_device
+
+    try:
+        return usable_device(args.device)
+    except DeviceError as error:
+        parser.error(f"--device {error}")
+
+
+def _predict(
+    args: argparse.Namespace, cloud: np.ndarray, device: torch.device
+) -> tuple[list[ScanPrediction], ArticulatedPoseEstimator]:
+    """What every set of weights that is asked says, best first, and the best one's estimator."""
+    from articulate_ssl.ops.denormals import flush_denormals
+    from articulate_ssl.pretrained.estimator import load
+    from articulate_ssl.pretrained.ranking import ranked
+
+    with flush_denormals():
+        estimator = load(args.category or args.ckpt, None if args.view == AUTO else args.view, device)
+        several = len(estimator.estimators) > 1
+        progress = track(
+            estimator.estimators, "trying weights", console=Console(stderr=True), disable=not several, transient=True
+        )
+        candidates = ranked([one.predict(cloud, args.refine) for one in progress])
     return candidates, next(one for one in estimator.estimators if one.weights == candidates[0].checkpoint)
 
 

@@ -55,7 +55,6 @@ def run(arguments: list[str]) -> int:
         parser.error(f"{', '.join(repeated)}: given more than once; give each scan once")
     from articulate_ssl.discovery.discover import DiscoveryError
     from articulate_ssl.inference.export.formats import ExportError, demand_folder
-    from articulate_ssl.inference.export.physics_check import PhysicsCheckError
     from articulate_ssl.ops.denormals import flush_denormals
     from datamodules.point_cloud_io import PointCloudError
 
@@ -63,7 +62,7 @@ def run(arguments: list[str]) -> int:
         demand_folder(args.out)
         with flush_denormals():
             _twin(args)
-    except (PointCloudError, DiscoveryError, ExportError, PhysicsCheckError, OSError) as error:
+    except (PointCloudError, DiscoveryError, ExportError, OSError) as error:
         print(f"articulate-ssl twin: {error}", file=sys.stderr)
         return BAD_INPUT
     return 0

@@ -28,7 +28,7 @@ from articulate_ssl.inference.prediction import ScanEstimate
 from articulate_ssl.inference.scan_prediction import ScanPrediction, in_scan_frame
 from articulate_ssl.ops.denormals import flush_denormals
 from articulate_ssl.pretrained.ranking import ranked
-from articulate_ssl.training.checkpoint import load_module
+from articulate_ssl.training.checkpoint import load_model
 from articulate_ssl.training.shipped_weights import ShippedWeights, find_weights, shipped_as, shipped_weights
 from articulate_ssl.training.weights_card import CARD_SUFFIX, WeightsCard
 from datamodules.point_cloud_io import PointCloudError, load_point_cloud, usable_scan
@@ -41,7 +41,7 @@ Cloud = np.ndarray | Tensor | str | os.PathLike  # [N, 3] in any unit and origin
 
 
 class ScanModule(Protocol):
-    """What is asked of a trained module.
+    """What is asked of a trained model.
 
     Attributes:
         category: What it was trained on.
@@ -126,7 +126,7 @@ class ArticulatedPoseEstimator(Estimator):
         DeviceError: if PyTorch cannot compute there.
 
     Attributes:
-        module: The trained module; for most it is an `ArticulatedPoseModule`.
+        module: The trained model; for most it is an `ArticulatedPoseModel`.
         weights: As given.
         card: As given.
     """
@@ -277,6 +277,6 @@ def _every_category(view: str | None) -> tuple[ShippedWeights, ...]:
 
 
 def _estimator(file: Path, weights: str, device: str | torch.device) -> ArticulatedPoseEstimator:
-    module, card = load_module(file), file.with_suffix(CARD_SUFFIX)
-    module.card = WeightsCard.load(card) if card.is_file() else None
-    return ArticulatedPoseEstimator(module, weights, module.card, device)
+    beside = file.with_suffix(CARD_SUFFIX)
+    card = WeightsCard.load(beside) if beside.is_file() else None
+    return ArticulatedPoseEstimator(load_model(file), weights, card, device)

@@ -20,6 +20,7 @@ import numpy as np
 import trimesh
 from lxml import etree
 
+from articulate_ssl.inference.export.formats import ExportError
 from articulate_ssl.inference.export.rigid_links import MESH_FOLDER
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ MIN_COVERED = 0.95
 OVERLAP_WORTH_A_NOTE = 0.02
 
 
-class PhysicsCheckError(ValueError):
+class PhysicsCheckError(ExportError):
     """The check cannot be made; the message says what to do."""
 
 

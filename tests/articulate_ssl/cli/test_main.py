@@ -69,6 +69,19 @@ def test_what_computes_nothing_waits_for_no_import(words):
     assert done.returncode == 0, done.stderr
 
 
+def test_a_bad_cloud_is_refused_before_the_networks_are_imported(tmp_path):
+    np.save(tmp_path / "flat.npy", np.zeros((5, 2)))
+    program = f"""if True:
+        import sys
+        from articulate_ssl.cli import main
+        code = main(["predict", {str(tmp_path / "flat.npy")!r}, "--category", "laptop"])
+        assert code == 2 and "torch" not in sys.modules, code
+    """
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "flat.npy" in done.stderr
+
+
 def test_a_missing_cloud_is_refused(run):
     refused(run("predict", "nowhere.ply", "--ckpt", "trained.ckpt"), "nowhere.ply")
 

@@ -52,11 +52,11 @@ class FakeModule(torch.nn.Module):
 def module(monkeypatch):
     fake = FakeModule()
 
-    def load_module(path):
+    def load_model(path):
         read_checkpoint(path)
         return fake
 
-    monkeypatch.setattr(estimator, "load_module", load_module)
+    monkeypatch.setattr(estimator, "load_model", load_model)
     return fake
 
 
@@ -71,7 +71,7 @@ def package(tmp_path, monkeypatch):
         fake.category, fake.unlike, fake.probability = name.split("-")[0], unlike, 0.6
         fake.orientation = OrientationRange(100.0 if name.endswith("depth") else 180.0)
     monkeypatch.setattr(shipped_weights, "WEIGHTS_FOLDER", folder)
-    monkeypatch.setattr(estimator, "load_module", lambda path: modules[path.stem])
+    monkeypatch.setattr(estimator, "load_model", lambda path: modules[path.stem])
     return modules
 
 
