@@ -157,8 +157,6 @@ class ArticulatedPoseModel(nn.Module):
         """[J, 2] lowest and highest joint state of training clouds, as predictions count them."""
         return self.states.known - self.hinge_sides.closed * self.hinge_sides.learnt
 
-    # Prediction
-
     def predict_points(
         self,
         points: Tensor,  # [B, N, 3] normalised, farthest-point order
