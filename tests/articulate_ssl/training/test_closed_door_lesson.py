@@ -12,12 +12,12 @@ from articulate_ssl.discovery import reshaping
 from articulate_ssl.discovery.from_scans import StandingScans
 from articulate_ssl.discovery.registered_shape import RegisteredShape
 from articulate_ssl.geometry.screw import REVOLUTE
-from articulate_ssl.geometry.se3 import se3
+from articulate_ssl.geometry.se3 import invert_se3, se3
 from articulate_ssl.inference.part_frames import PartFrames
 from articulate_ssl.inference.state_range import StateRange
 from articulate_ssl.inference.view_search import ViewSearch
 from articulate_ssl.ops.chamfer import nearest_distance
-from articulate_ssl.training.closed_door_lesson import learn_closed_doors
+from articulate_ssl.training.closed_door_lesson import _Space, learn_closed_doors
 
 COUNT, POINTS = 6, 100
 SEEN = (ZERO + 0.9, ZERO + 1.8)
@@ -57,8 +57,23 @@ def module():
     return made
 
 
-def test_views_show_doors_from_closed_to_where_training_begins(module, monkeypatch):
+def _elsewhere(scans: StandingScans, frame: torch.Tensor) -> StandingScans:
+    """The same, found in another canonical space, where states count from elsewhere and in the other sense."""
+    found, middle = scans.found, ZERO + 0.3
+    points = found.shape.posed(torch.eye(4)[None], torch.full((1, 1), middle))[0]
+    shape = replace(found.shape, points=points, joints=replace(found.shape.joints, axis=-found.shape.joints.axis))
+    base, turns = found.base @ invert_se3(frame), scans.turns @ frame[:3, :3].mT
+    found = replace(found, shape=shape.in_frame(frame), base=base, state=middle - found.state)
+    return replace(scans, found=found, turns=turns)
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_views_show_doors_from_closed_to_where_training_begins(module, monkeypatch, elsewhere):
     monkeypatch.setattr(reshaping, "_SPREAD", 0.0)  # of the very object, whose shape is known
+    if elsewhere:
+        turn = roma.random_rotmat(1, generator=torch.Generator().manual_seed(1))[0]
+        scans = _elsewhere(_scans(), se3(turn, torch.zeros(3)))
+        module.recipe.standing_scans = lambda *_: scans
     learn_closed_doors(module, None)
     views = module.estimator.closed_views
     assert 18 <= len(views.views) <= 24  # four of each scan, but for those that show too little
@@ -75,6 +90,18 @@ def test_views_show_doors_from_closed_to_where_training_begins(module, monkeypat
         assert off.min() < 0.01
         away = nearest_distance((inside / scales[off.argmin()])[None], whole[module.shape.label == 1][None])[0]
         assert (away[views.part[one] == 1] < 0.03).all()
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_views_are_told_in_the_categorys_space(module, seed):
+    turn = roma.random_rotmat(generator=torch.Generator().manual_seed(seed))
+    frame = se3(turn, torch.tensor([0.1, -0.2, 0.05]))
+    found = _elsewhere(_scans(), frame).found
+    space = _Space.of(replace(found, shape=found.shape.scaled(3.0)), module.shape, module.states.starts())
+    torch.testing.assert_close(space.frame, frame, atol=0.004, rtol=0)
+    states = torch.tensor([[ZERO], [ZERO + 0.3], [ZERO + 1.0]])
+    torch.testing.assert_close(space.found_states(states), torch.tensor([[0.3], [0.0], [-0.7]]), atol=0.01, rtol=0)
+    torch.testing.assert_close(space.states(space.found_states(states)), states)
 
 
 def test_an_earlier_runs_views_are_forgotten(module):
@@ -95,7 +122,7 @@ def test_doors_that_training_shows_closed_need_no_views(module, least):
 @pytest.mark.parametrize("what", ["axis", "pivot"])
 def test_scans_whose_hinge_is_elsewhere_than_the_categorys_teach_nothing(module, caplog, what):
     joints = module.shape.joints
-    other = {"axis": -joints.axis, "pivot": (PIVOT + torch.tensor([0.5, 0.2, 0.0]))[None]}[what]
+    other = {"axis": joints.axis.roll(1, dims=1), "pivot": (PIVOT + torch.tensor([0.5, 0.2, 0.0]))[None]}[what]
     scans = _scans()
     shape = replace(scans.found.shape, joints=replace(joints, **{what: other}))
     scans = replace(scans, found=replace(scans.found, shape=shape))
