@@ -8,18 +8,26 @@ Training shows doors that are open, and users scan closed ones, which no view wa
 for an open door. But scans show whole objects, and a door whose hinge is known can be closed in them before they are
 seen by a camera (`training/closed_door_lesson.py`). Such views are sought, too, apart from the others, which stay as
 they were, and are believed where they explain a cloud clearly better (docs/experiments.md, step 279).
+
+A closed box still fits as well with another of its sides for the door. What it looks like says more (`box_turns`), if
+that was taught: where a door is as training did not show it, and the box looks clearly righter in another way, it is
+explained in that way (step 289).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
+import torch
 from torch import Tensor
 
+from articulate_ssl.discovery.manhattan_frame import CAP, manhattan_frames
+from articulate_ssl.inference.box_turns import VIEW_POINTS, BoxTurns
+from articulate_ssl.inference.candidates import ANOTHER_WAY, angle_to
 from articulate_ssl.inference.contest import CLEARLY, Contest
 from articulate_ssl.inference.final_fit import FinalFit
 from articulate_ssl.inference.upright_camera import UprightCamera
-from articulate_ssl.inference.view_search import ViewSearch
+from articulate_ssl.inference.view_search import Seen, ViewSearch
 from articulate_ssl.inference.votes import Votes
 from articulate_ssl.network.hypotheses import Hypotheses
 
@@ -31,10 +39,11 @@ class OtherViews:
         final: How explanations are fitted in the end, by views and a registration.
         camera: Which way is up.
         closed: Views of doors that are nearly closed, if there are any.
+        turns: Which way round boxes look right.
     """
 
-    def __init__(self, final: FinalFit, camera: UprightCamera, closed: ViewSearch) -> None:
-        self.final, self.camera, self.closed = final, camera, closed
+    def __init__(self, final: FinalFit, camera: UprightCamera, closed: ViewSearch, turns: BoxTurns) -> None:
+        self.final, self.camera, self.closed, self.turns = final, camera, closed, turns
 
     @property
     def lie(self) -> bool:
@@ -62,16 +71,60 @@ class OtherViews:
         contest = Contest(one, rival, margin, final.distance(one, points))
         for views, lying, shown in kinds:
             seen = views.search(points, shown=shown)
-            start = final.articulated.category_at(seen.base[:, :1], seen.state[:, :1])
-            tried, _ = final.registration.registered(start, points)
-            tried = final.in_proportion(tried, points, dense)
+            tried = self._fitted(seen, points, dense)
             likely = final.registration.states.contains(tried.state[:, 0])
             if lying is not None:
                 likely &= (self.camera.stood(tried.base[:, 0, :3, :3])[1] > 0) == lying
             least = CLEARLY if views is self.closed else 1.0
             contest, rows = contest.against(tried, final.distance(tried, points), likely, least)
             votes = votes._replace(share=votes.share.index_copy(0, rows, seen.votes.share[rows]))
+        if self.turns.learnt and self.camera.learnt and dense is not None:
+            contest, votes = self._looking_right(contest, votes, points, dense)
         return contest.one, contest.rival, contest.margin, votes
+
+    def _looking_right(self, contest: Contest, votes: Votes, points: Tensor, dense: Tensor) -> tuple[Contest, Votes]:
+        """What is explained with a door as training did not show it gives way to what looks right, however either fits.
+
+        Of what stands so in all views and in those of closed doors the one that fits better.
+        """
+        final, states = self.final, self.final.registration.states
+        rows = (~states.showed(contest.one.state[:, 0])).nonzero()[:, 0]
+        if not len(rows):
+            return contest, votes
+        frames, angle = manhattan_frames(dense[rows], torch.Generator().manual_seed(0))
+        looks = self.turns.looks(dense[rows, :VIEW_POINTS], frames, seen=self._seen)
+        turn, stood = looks.likeliest, self.camera.stood(contest.one.base[rows, 0, :3, :3])[0]
+        other = looks.decided & (angle < CAP) & (angle_to(stood[:, None], turn)[:, 0] > ANOTHER_WAY)
+        rows, turn, own = rows[other], turn[other], points[rows[other]]
+        if not len(rows):
+            return contest, votes
+        won = torch.zeros_like(contest.margin, dtype=torch.bool)
+        for views in (final.view_search, self.closed):
+            shown = (views.quarters == 0).nonzero()[:, 0]
+            if not len(shown):
+                continue
+            seen = views.search(own, turn, shown)
+            tried = self._fitted(seen, own, dense[rows])
+            right = angle_to(tried.base[..., :3, :3], turn)[:, 0] < ANOTHER_WAY
+            likely = torch.zeros_like(won).index_copy(0, rows, right & states.contains(tried.state[:, 0]))
+            error = torch.full_like(contest.error, torch.inf).index_copy(0, rows, final.distance(tried, own))
+            everywhere = contest.one.with_rows(rows, tried)
+            contest, better = contest.against(everywhere, error, likely, torch.where(won, 1.0, torch.inf))
+            won = won.index_fill(0, better, True)
+            share = votes.share.index_copy(0, rows, seen.votes.share)
+            votes = votes._replace(share=votes.share.index_copy(0, better, share[better]))
+        return contest, votes
+
+    def _seen(self, rotation: Tensor) -> Tensor:
+        """Whether a camera sees objects that are turned so, and stand."""
+        return self.final.registration.observation.allows(rotation) & (self.camera.stood(rotation)[1] == 0)
+
+    def _fitted(self, seen: Seen, points: Tensor, dense: Tensor | None) -> Hypotheses:
+        """What views say, in the clouds' proportions."""
+        final = self.final
+        start = final.articulated.category_at(seen.base[:, :1], seen.state[:, :1])
+        tried, _ = final.registration.registered(start, points)
+        return final.in_proportion(tried, points, dense)
 
     def _kinds(self) -> Iterator[tuple[ViewSearch, bool | None, Tensor | None]]:
         """Views, whether those that are sought lie, which these are; None is not known, and all."""

@@ -139,7 +139,7 @@ class PoseEstimator(Proposals):
             self.object_frame,
             inference.proportions,
         )
-        self.other_views = OtherViews(self.final, self.hinge_sides.camera, self.closed_views)
+        self.other_views = OtherViews(self.final, self.hinge_sides.camera, self.closed_views, self.box_turns)
         self.square_search = SquareSearch(self.final, self.hinge_sides, self.box_turns)
 
     @property

@@ -131,7 +131,7 @@ class ViewSearch(nn.Module):
 
         Args:
             turn: Only views whose objects are turned about so are compared.
-            shown: Without that, which views are; None are all.
+            shown: And of these only those; None are all.
         """
         views, step, base, state = (value.to(points) for value in (self.views, self.step, self.base, self.state))
         views = from_few_bytes(views, step)
@@ -139,7 +139,7 @@ class ViewSearch(nn.Module):
         thin, still = views[:, :_COMPARED].contiguous(), torch.eye(3).to(points)[None]
         found, states, errors, votes = [], [], [], []
         for i, cloud in enumerate(points):
-            among = every if turn is None else angle_to(base[None, :, :3, :3], turn[i, None])[0].argsort()[:_ALIKE]
+            among = every if turn is None else every[_most_alike(base[every, :3, :3], turn[i])]
             own, copies = thin[among], cloud[:_COMPARED].expand(len(among), -1, -1)
             distance = nearest_distance(copies, own).mean(dim=1) + nearest_distance(own, copies).mean(dim=1)
             nearest = among[distance.topk(min(_NEAREST, len(among)), largest=False).indices]
@@ -177,6 +177,14 @@ class ViewSearch(nn.Module):
         taught = any(name.startswith(f"{prefix}parts.") for name in state_dict)
         self.parts = ViewParts(self.num_parts).to(self.base).requires_grad_(False) if taught else None
         super()._load_from_state_dict(state_dict, prefix, *rest)
+
+
+def _most_alike(
+    rotation: Tensor,  # [S, 3, 3]
+    turn: Tensor,  # [3, 3]
+) -> Tensor:
+    """Which of the rotations are most like a turn."""
+    return angle_to(rotation[None], turn[None])[0].argsort()[:_ALIKE]
 
 
 def _evenly(rows: Tensor, count: int) -> Tensor:

@@ -22,6 +22,7 @@ from articulate_ssl.training.self_agreement import learn_confidence
 from articulate_ssl.training.set_clouds import SetClouds
 from articulate_ssl.training.standing_lesson import learn_standing_part
 from articulate_ssl.training.turn_lessons import learn_turns, learn_view_turns
+from articulate_ssl.training.view_look_lesson import learn_view_looks
 
 if TYPE_CHECKING:
     from articulate_ssl.training.module import ArticulatedPoseModule
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 # and again when it is known how faces lie: that moves states.
 LESSONS = (
     *("first_limits", "two_ways", "turns", "objects", "handedness", "part_frames", "view_turns", "hinge_sides"),
-    *("joint_limits", "closed_doors", "poses", "box_turns", "standing_part", "confidence"),
+    *("joint_limits", "closed_doors", "view_looks", "poses", "box_turns", "standing_part", "confidence"),
 )
 
 
@@ -100,6 +101,7 @@ def plan(module: ArticulatedPoseModule) -> dict[str, Lesson]:
         "hinge_sides": Lesson(learn_hinge_sides, module.hinge_sides_samples if refines else 0),
         "joint_limits": limits,
         "closed_doors": Lesson(learn_closed_doors, module.closed_views_samples if doors else 0, of_scans=True),
+        "view_looks": Lesson(learn_view_looks, module.view_looks_samples if doors else 0, of_scans=True),
         "poses": Lesson(learn_poses, module.pose_samples if refines and turns else 0),
         "box_turns": Lesson(learn_box_turns, module.box_turns_samples if refines and turns and any_way else 0),
         "standing_part": Lesson(learn_standing_part, 0 if any_way else calibration),

@@ -73,6 +73,8 @@ class ArticulatedPoseModel(nn.Module):
             (`inference.pose_network`); half an hour, most of it to register them. 0 learns none.
         closed_views_samples: Views of scans with doors nearly closed, which training does not show, that are sought,
             too, where simulated views teach (`inference.other_views`); 0 simulates none.
+        view_looks_samples: Views of scans, most of them with doors nearly closed, by which a network learns which way
+            round boxes look in views (`inference.other_views`); 10 minutes. 0 learns none.
         box_turns_samples: Training clouds of boxes with doors, in which these are closed, by which a network learns
             which way round boxes are (`inference.box_turns`); 15 minutes, most of it to register them. 0 learns none.
         orientation_range: How far objects are turned from their mean orientation at most, in degrees; 180 stands for
@@ -103,6 +105,7 @@ class ArticulatedPoseModel(nn.Module):
         hinge_sides_samples: int = 2000,
         pose_samples: int = 1600,
         closed_views_samples: int = 500,
+        view_looks_samples: int = 2400,
         box_turns_samples: int = 640,
         orientation_range: float = 180.0,
     ) -> None:
@@ -124,7 +127,7 @@ class ArticulatedPoseModel(nn.Module):
         self.handedness_samples = handedness_samples
         self.part_frames_samples, self.hinge_sides_samples = part_frames_samples, hinge_sides_samples
         self.pose_samples, self.box_turns_samples = pose_samples, box_turns_samples
-        self.closed_views_samples = closed_views_samples
+        self.closed_views_samples, self.view_looks_samples = closed_views_samples, view_looks_samples
         require_at_least(self, **{name: 0 for name in options if name.endswith("_samples")})
 
         self.articulated = ArticulatedNetwork(network, num_parts, JOINT_TYPES[joint_type], state_bound=state_range)

@@ -17,7 +17,8 @@ from articulate_ssl.inference.part_frames import PartFrames
 from articulate_ssl.inference.state_range import StateRange
 from articulate_ssl.inference.view_search import ViewSearch
 from articulate_ssl.ops.chamfer import nearest_distance
-from articulate_ssl.training.closed_door_lesson import _Space, learn_closed_doors
+from articulate_ssl.training.closed_door_lesson import learn_closed_doors
+from articulate_ssl.training.scan_space import ScanSpace
 
 COUNT, POINTS = 6, 100
 SEEN = (ZERO + 0.9, ZERO + 1.8)
@@ -97,7 +98,7 @@ def test_views_are_told_in_the_categorys_space(module, seed):
     turn = roma.random_rotmat(generator=torch.Generator().manual_seed(seed))
     frame = se3(turn, torch.tensor([0.1, -0.2, 0.05]))
     found = _elsewhere(_scans(), frame).found
-    space = _Space.of(replace(found, shape=found.shape.scaled(3.0)), module.shape, module.states.starts())
+    space = ScanSpace.of(module.shape, replace(found, shape=found.shape.scaled(3.0)), module.states.starts())
     torch.testing.assert_close(space.frame, frame, atol=0.004, rtol=0)
     states = torch.tensor([[ZERO], [ZERO + 0.3], [ZERO + 1.0]])
     torch.testing.assert_close(space.found_states(states), torch.tensor([[0.3], [0.0], [-0.7]]), atol=0.01, rtol=0)

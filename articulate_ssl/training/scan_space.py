@@ -1,0 +1,99 @@
+"""Views of scans, told as the category is, though discovery that is done once more may lay canonical space otherwise.
+
+Other code, or another draw, finds the same parts and hinge in another canonical space, and counts joint states from
+elsewhere, or in the other sense. The category's shape, registered to what was found, says how.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from articulate_ssl.discovery.from_scans import StandingScans
+from articulate_ssl.discovery.registered_shape import RegisteredShape
+from articulate_ssl.discovery.registration import register_articulated
+from articulate_ssl.discovery.search import search_articulated
+from articulate_ssl.geometry.rotation_group import rotation_group
+from articulate_ssl.shape.articulated_shape import ArticulatedShape
+
+# Degrees and length by which hinges differ at most, of a shape and of what discovery found, or found once more. Chosen:
+# training moves them by about one degree and a hundredth.
+_ANGLE, _APART = 10.0, 0.1
+_FINER, _ROUNDS = (0.03, 0.003), 20  # scales of the registration after the search
+
+
+@dataclass(frozen=True)
+class ScanSpace:
+    """Where the canonical space of a category with one joint is in that of what was found.
+
+    Attributes:
+        shape: The category's.
+        frame: [4, 4] its canonical object space -> that of what was found, as large as the category's.
+        state: [1] joint state, as the category counts, of what has the state `found`.
+        found: [1]
+        sense: [1] 1, or -1 if the one counts up where the other counts down.
+    """
+
+    shape: ArticulatedShape
+    frame: Tensor
+    state: Tensor
+    found: Tensor
+    sense: Tensor
+
+    @staticmethod
+    def of(
+        shape: ArticulatedShape,
+        found: RegisteredShape,
+        starts: Tensor,  # [Q, 1] states from which the category's is sought, the middle of what was seen first
+    ) -> ScanSpace | None:
+        """Of a shape that is registered to what was found; None if they do not have about the same joint then."""
+        still, state = torch.eye(4).to(shape.points)[None], found.state.median(dim=0).values
+        size, other = (_size(one.posed(still, at[None])) for one, at in ((shape, starts[0]), (found.shape, state)))
+        other = found.shape.scaled(float(size / other))  # views are larger or smaller than scans
+        posed = other.posed(still, state[None])
+        cloud = posed[:, torch.randperm(posed.shape[1], generator=torch.Generator().manual_seed(0))]
+        frame, own, _ = search_articulated(shape, cloud, rotation_group(60).elements.to(cloud), starts)
+        frame, own, _ = register_articulated(shape, cloud, frame[:, 0], own[:, 0], _FINER, _ROUNDS)
+        placed = shape.in_frame(frame[0])
+        if not _same_line(other, placed):
+            return None
+        sense = (other.joints.axis * placed.joints.axis).sum(dim=-1).sign()
+        return ScanSpace(shape, frame[0], own[0], state, sense)
+
+    def views(
+        self,
+        scans: StandingScans,
+        num_points: int,
+        generator: np.random.Generator,
+        count: int,
+        limits: Tensor,  # [2] between which joint states are, as the category counts
+    ) -> tuple[Tensor, RegisteredShape]:
+        """`StandingScans.views`, and the category's shape registered to them."""
+        ends = self.found_states(limits[:, None]).T.sort()[0]
+        views, found = scans.views(num_points, generator, count, ends)
+        return views, replace(found, shape=self.shape, base=found.base @ self.frame, state=self.states(found.state))
+
+    def found_states(self, state: Tensor) -> Tensor:
+        """Joint states of the category, as what was found counts them."""
+        return self.found + self.sense * (state - self.state)
+
+    def states(self, found: Tensor) -> Tensor:
+        """The other way."""
+        return self.state + self.sense * (found - self.found)
+
+
+def _size(points: Tensor) -> Tensor:  # [1, T, 3], []
+    """Root mean square distance from their mean."""
+    return (points - points.mean(dim=1, keepdim=True)).square().sum(dim=-1).mean().sqrt()
+
+
+def _same_line(one: ArticulatedShape, other: ArticulatedShape) -> bool:
+    """Whether two shapes have about the same joint, in either sense."""
+    axis, pivot = other.joints.axis[0], other.joints.pivot[0]
+    cosine = (one.joints.axis[0] @ axis).abs()
+    between = torch.linalg.cross(one.joints.pivot[0] - pivot, axis).norm()
+    return bool(cosine > math.cos(math.radians(_ANGLE)) and between < _APART)
