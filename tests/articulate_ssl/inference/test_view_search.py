@@ -5,11 +5,12 @@ import roma
 import torch
 from articulated_objects import OVEN, Clouds, clouds
 
+from articulate_ssl.discovery.manhattan_frame import CAP
 from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.geometry.orientation_range import OrientationRange
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import se3, transform_points
-from articulate_ssl.inference import view_search
+from articulate_ssl.inference import other_views, view_search
 from articulate_ssl.inference.contest import CLEARLY
 from articulate_ssl.inference.hinge_sides import closed_state
 from articulate_ssl.inference.options import InferenceOptions
@@ -290,6 +291,68 @@ def test_closed_doors_are_sought_among_their_own_views_and_believed_where_they_f
     finally:
         estimator.closed_views.forget()
         estimator.states.forget()
+
+
+class _Likes(torch.nn.Module):
+    """To it boxes look right as it is told, by so much."""
+
+    def __init__(self, right: torch.Tensor, by: float) -> None:
+        super().__init__()
+        self.right, self.by, self.read = right, by, []
+        self.register_buffer("temperature", torch.tensor(1.0))
+
+    def looks_right(self, frames, dense):
+        self.read.append(dense.shape)
+        best = _degrees(frames, self.right[:, None].expand_as(frames)).argmin(dim=1)
+        return torch.zeros(frames.shape[:2]).index_put((torch.arange(len(frames)), best), torch.tensor(self.by))
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("case", ["clearly", "hardly", "shown", "unseen", "no frame"])
+def test_what_looks_right_another_way_is_explained_so_where_training_showed_no_such_door(
+    learnt, estimator, monkeypatch, case
+):
+    """Three clouds, of which two are explained the wrong way round, but fit; to a network the truth looks right."""
+    data = _views(3, seed=8)
+    points, truth = data.points[:, :256], data.base[:, :3, :3]
+    base = data.base.clone()
+    base[:2, :3, :3] = base[:2, :3, :3] @ OVER
+    one = estimator.articulated.category_at(base[:, None], data.state[:, None])
+    angle = torch.full((3,), CAP if case == "no frame" else 1.0)
+    monkeypatch.setattr(other_views, "manhattan_frames", lambda dense, _: (truth.mT, angle))
+    fits = lambda this, points: torch.full((len(points),), 1.0 if this is one else 5.0)  # noqa: E731
+    monkeypatch.setattr(estimator.final, "distance", fits)
+    monkeypatch.setattr(UprightCamera, "stood", _stands)
+    monkeypatch.setattr(Observation, "allows", lambda _, turn: torch.full(turn.shape[:-2], case != "unseen"))
+    estimator.hinge_sides.camera.learnt.fill_(True)
+    estimator.view_search.load_state_dict(learnt.state_dict())
+    estimator.closed_views.load_state_dict(learnt.state_dict())
+    estimator.states.seen.copy_(torch.tensor([[-3.0, 3.0] if case == "shown" else [3.0, 4.0]]))
+    estimator.states.set_rest(-3.0)
+    estimator.box_turns.surface = likes = _Likes(truth, 1.0 if case == "hardly" else 6.0)
+    votes = learnt.search(points).votes
+    votes = votes._replace(share=torch.full_like(votes.share, 0.5))
+    given = one, one, torch.full((3,), 2.0), votes, points, data.points
+    try:
+        found, rival, margin, said = estimator.other_views.sought(*given)
+        assert torch.equal(found.base[2], one.base[2]) and (said.share[2] == 0.5).all()
+        if case != "clearly":
+            assert torch.equal(found.base, one.base) and (said.share == 0.5).all()
+            return
+        assert likes.read == [(3, 512, 3)]
+        assert _degrees(found.base[:2, 0, :3, :3], truth[:2]).max() < 20
+        assert torch.equal(rival.base[:2], one.base[:2])
+        torch.testing.assert_close(margin[:2], torch.full((2,), 0.8))
+        assert (said.share[:2] != 0.5).flatten(1).any(dim=1).all()
+    finally:
+        estimator.box_turns.surface = None
+        estimator.closed_views.forget()
+        estimator.states.forget()
+
+
+def _stands(_, turn):
+    """Whatever it is, it stands."""
+    return turn, torch.zeros(turn.shape[:-2]).long(), torch.ones(turn.shape[:-2]).bool()
 
 
 @torch.no_grad()
