@@ -22,6 +22,7 @@ from torch import Tensor
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.inference.hinge_sides import DECIDED
 from articulate_ssl.inference.surface_decision import WithSurface
+from articulate_ssl.inference.upright_camera import UprightCamera
 
 # Of depth views, that the network is taught by, and reads. Scans of 4,096 points show as many of nearly all closed
 # boxes, twice as many of few.
@@ -74,12 +75,14 @@ class BoxTurns(WithSurface):
 
     Attributes:
         axes: [3, 3] columns: of the frame in which boxes look right, in canonical space.
+        camera: Which way is up for the camera of the views that taught it, where `hinge_sides` does not know that.
         surface: How right clouds look in a frame; None if it was not taught.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.register_buffer("axes", torch.eye(3))
+        self.camera = UprightCamera()
 
     @property
     def learnt(self) -> bool:

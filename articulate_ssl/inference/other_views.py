@@ -78,7 +78,7 @@ class OtherViews:
             least = CLEARLY if views is self.closed else 1.0
             contest, rows = contest.against(tried, final.distance(tried, points), likely, least)
             votes = votes._replace(share=votes.share.index_copy(0, rows, seen.votes.share[rows]))
-        if self.turns.learnt and self.camera.learnt and dense is not None:
+        if self.turns.learnt and dense is not None:
             contest, votes = self._looking_right(contest, votes, points, dense)
         return contest.one, contest.rival, contest.margin, votes
 
@@ -93,7 +93,7 @@ class OtherViews:
             return contest, votes
         frames, angle = manhattan_frames(dense[rows], torch.Generator().manual_seed(0))
         looks = self.turns.looks(dense[rows, :VIEW_POINTS], frames, seen=self._seen)
-        turn, stood = looks.likeliest, self.camera.stood(contest.one.base[rows, 0, :3, :3])[0]
+        turn, stood = looks.likeliest, self._upright.stood(contest.one.base[rows, 0, :3, :3])[0]
         other = looks.decided & (angle < CAP) & (angle_to(stood[:, None], turn)[:, 0] > ANOTHER_WAY)
         rows, turn, own = rows[other], turn[other], points[rows[other]]
         if not len(rows):
@@ -117,7 +117,13 @@ class OtherViews:
 
     def _seen(self, rotation: Tensor) -> Tensor:
         """Whether a camera sees objects that are turned so, and stand."""
-        return self.final.registration.observation.allows(rotation) & (self.camera.stood(rotation)[1] == 0)
+        _, quarters, stands = self._upright.stood(rotation)
+        return self.final.registration.observation.allows(rotation) & stands & (quarters == 0)
+
+    @property
+    def _upright(self) -> UprightCamera:
+        """Which way is up, as far as looks are concerned."""
+        return self.camera if self.camera.learnt else self.turns.camera
 
     def _fitted(self, seen: Seen, points: Tensor, dense: Tensor | None) -> Hypotheses:
         """What views say, in the clouds' proportions."""

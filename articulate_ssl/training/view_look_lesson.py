@@ -46,6 +46,10 @@ def learn_view_looks(
     estimator, states = module.estimator, module.states
     turns, camera = estimator.box_turns, estimator.hinge_sides.camera
     turns.surface = None  # of a run that ended and goes on
+    turns.camera.forget()
+    if not camera.learnt:
+        camera = turns.camera
+        camera.learn(estimator.view_search.base[:, :3, :3], estimator.hinge_sides.axes)
     if not (camera.learnt and estimator.closed_views.learnt):
         tell(log, "how views look: it is not known which way is up, or how closed doors look")
         return

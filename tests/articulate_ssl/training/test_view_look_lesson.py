@@ -11,12 +11,14 @@ from boxes_with_doors import ZERO
 from scanned_boxes import COUNT, SEEN, module_of_boxes
 
 from articulate_ssl.discovery import reshaping
+from articulate_ssl.geometry.se3 import se3
 from articulate_ssl.inference.box_turns import BoxTurns
 from articulate_ssl.inference.upright_camera import UprightCamera
+from articulate_ssl.inference.view_search import ViewSearch
 from articulate_ssl.training import view_look_lesson
 from articulate_ssl.training.view_look_lesson import learn_view_looks
 
-FACES_CAMERA = torch.diag(torch.tensor([1.0, -1.0, -1.0]))  # the door, at -z, and what is on top, at +y, seen upright
+FACES_CAMERA = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))  # the door, at -z, and what is on top, at +y, seen upright
 AXES = torch.tensor([[0.0, 0, -1], [1, 0, 0], [0, -1, 0]])  # columns: of the box
 TURNS = 60
 
@@ -38,7 +40,9 @@ def module(monkeypatch):
     turns = turns @ torch.where(lie[:, None, None], quarter, torch.eye(3))[:, None]
     made.scans = replace(made.scans, turns=turns)
     made.part_frames.axes.copy_(AXES.expand(2, 3, 3))
-    made.estimator.box_turns, made.estimator.hinge_sides = BoxTurns(), SimpleNamespace(camera=camera)
+    made.estimator.box_turns, made.estimator.view_search = BoxTurns(), ViewSearch(2)
+    hinge_first = torch.eye(3)  # as `HingeSides.axes` are
+    made.estimator.hinge_sides = SimpleNamespace(camera=camera, axes=hinge_first)
     made.estimator.other_views = SimpleNamespace(measure=lambda: made.states.set_rest(ZERO))
     made.estimator.closed_views.views = torch.zeros(1, 8, 3, dtype=torch.int8)  # there are some
     made.view_looks_samples, made.device = 300, torch.device("cpu")
@@ -60,7 +64,7 @@ def test_four_quarters_of_every_view_are_taught_and_the_first_stands(module, mon
     relative = frames[:, :1].mT @ frames
     cosine = (relative.diagonal(dim1=-2, dim2=-1).sum(dim=-1) - 1) / 2
     torch.testing.assert_close(cosine, torch.tensor([1.0, 0.0, -1.0, 0.0]).expand(count, 4), atol=1e-5, rtol=0)
-    # Doors are at the front, of what stands: nothing of a box is as far out as they are.
+    # Doors are at the front.
     assert torch.equal(module.estimator.box_turns.axes, AXES)
     front = frames[:, 0] @ AXES.T @ torch.tensor([0.0, 0.0, -1.0])
     assert (front[:, 2] < 0.2).all()  # towards the camera, or nearly
@@ -81,6 +85,22 @@ def test_most_doors_are_nearly_closed(module, monkeypatch):
     assert closed.min() > ZERO - 0.05 and closed.max() < SEEN[0] + 0.05
     assert opened.min() > SEEN[0] - 0.05 and opened.max() < SEEN[1] + 0.05
     assert len(closed) / len(opened) == pytest.approx(2, abs=0.3)
+
+
+def test_where_nothing_lies_simulated_views_say_which_way_is_up(module, monkeypatch):
+    asked = []
+    monkeypatch.setattr(view_look_lesson, "learn_surface", lambda *of: asked.append(of))
+    module.estimator.hinge_sides.camera.forget()
+    turns = module.scans.turns[1]
+    module.estimator.view_search.base = se3(turns, torch.zeros(len(turns), 3))
+    learn_view_looks(module, None)
+    camera = module.estimator.box_turns.camera
+    assert camera.learnt and torch.equal(camera.up, torch.tensor([0.0, 1.0, 0.0]))
+    up = asked[0][1] @ AXES[1]
+    torch.testing.assert_close(up, torch.tensor([0.0, -1.0, 0.0]).expand_as(up), atol=0.004, rtol=0)
+    module.estimator.hinge_sides.camera.learnt.fill_(True)
+    learn_view_looks(module, None)
+    assert not camera.learnt  # one of them is enough
 
 
 def test_nothing_is_taught_where_up_or_closed_doors_are_not_known(module, monkeypatch):
