@@ -23,7 +23,8 @@ from articulate_ssl.shape.articulated_shape import ArticulatedShape
 # Degrees and length by which hinges differ at most, of a shape and of what discovery found, or found once more. Chosen:
 # training moves them by about one degree and a hundredth.
 _ANGLE, _APART = 10.0, 0.1
-_FINER, _ROUNDS = (0.03, 0.003), 20  # scales of the registration after the search
+_OF_PART = 300  # points by which shapes are registered
+_FINER, _ROUNDS = (0.03, 0.003), 20  # scales of that after the search
 
 
 @dataclass(frozen=True)
@@ -51,11 +52,11 @@ class ScanSpace:
         starts: Tensor,  # [Q, 1] states from which the category's is sought, the middle of what was seen first
     ) -> ScanSpace | None:
         """Of a shape that is registered to what was found; None if they do not have about the same joint then."""
-        still, state = torch.eye(4).to(shape.points)[None], found.state.median(dim=0).values
-        size, other = (_size(one.posed(still, at[None])) for one, at in ((shape, starts[0]), (found.shape, state)))
+        state = found.state.median(dim=0).values
+        size, other = (_size(_posed(one, at)) for one, at in ((shape, starts[0]), (found.shape, state)))
         other = found.shape.scaled(float(size / other))  # views are larger or smaller than scans
-        posed = other.posed(still, state[None])
-        cloud = posed[:, torch.randperm(posed.shape[1], generator=torch.Generator().manual_seed(0))]
+        cloud = _posed(other, state)
+        cloud = cloud[:, torch.randperm(cloud.shape[1], generator=torch.Generator().manual_seed(0))]
         frame, own, _ = search_articulated(shape, cloud, rotation_group(60).elements.to(cloud), starts)
         frame, own, _ = register_articulated(shape, cloud, frame[:, 0], own[:, 0], _FINER, _ROUNDS)
         placed = shape.in_frame(frame[0])
@@ -84,6 +85,16 @@ class ScanSpace:
     def states(self, found: Tensor) -> Tensor:
         """The other way."""
         return self.state + self.sense * (found - self.found)
+
+
+def _posed(
+    shape: ArticulatedShape,
+    state: Tensor,  # [1]
+) -> Tensor:  # [1, K * _OF_PART, 3]
+    """In canonical space, as many points of every part: a category's shape has so, what was found has not."""
+    whole = shape.posed(torch.eye(4).to(shape.points)[None], state[None])
+    rows = [(shape.label == part).nonzero()[:, 0] for part in range(shape.num_parts)]
+    return whole[:, torch.cat([own[torch.linspace(0, len(own) - 1, _OF_PART).round().long()] for own in rows])]
 
 
 def _size(points: Tensor) -> Tensor:  # [1, T, 3], []

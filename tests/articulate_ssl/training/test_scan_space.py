@@ -25,10 +25,13 @@ def test_the_categorys_space_is_found_in_another(module, seed):
     turn = roma.random_rotmat(generator=torch.Generator().manual_seed(seed))
     frame = se3(turn, torch.tensor([0.1, -0.2, 0.05]))
     found = found_elsewhere(module.scans, frame).found
-    space = ScanSpace.of(module.shape, replace(found, shape=found.shape.scaled(3.0)), module.states.starts())
-    torch.testing.assert_close(space.frame, frame, atol=0.004, rtol=0)
+    parts = [(module.shape.label == part).nonzero()[::step, 0] for part, step in ((0, 3), (1, 1))]  # 200 points of each
+    rows = torch.cat(parts)
+    shape = replace(module.shape, points=module.shape.points[rows], label=module.shape.label[rows])
+    space = ScanSpace.of(shape, replace(found, shape=found.shape.scaled(3.0)), module.states.starts())
+    torch.testing.assert_close(space.frame, frame, atol=0.02, rtol=0)
     states = torch.tensor([[ZERO], [ZERO + 0.3], [ZERO + 1.0]])
-    torch.testing.assert_close(space.found_states(states), torch.tensor([[0.3], [0.0], [-0.7]]), atol=0.01, rtol=0)
+    torch.testing.assert_close(space.found_states(states), torch.tensor([[0.3], [0.0], [-0.7]]), atol=0.03, rtol=0)
     torch.testing.assert_close(space.states(space.found_states(states)), states)
 
 
