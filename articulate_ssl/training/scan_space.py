@@ -52,7 +52,7 @@ class ScanSpace:
         starts: Tensor,  # [Q, 1] states from which the category's is sought, the middle of what was seen first
     ) -> ScanSpace | None:
         """Of a shape that is registered to what was found; None if they do not have about the same joint then."""
-        state = found.state.median(dim=0).values
+        shape, starts, state = _beside(shape, found.base), starts.to(found.base), found.state.median(dim=0).values
         size, other = (_size(_posed(one, at)) for one, at in ((shape, starts[0]), (found.shape, state)))
         other = found.shape.scaled(float(size / other))  # views are larger or smaller than scans
         cloud = _posed(other, state)
@@ -74,7 +74,7 @@ class ScanSpace:
         limits: Tensor,  # [2] between which joint states are, as the category counts
     ) -> tuple[Tensor, RegisteredShape]:
         """`StandingScans.views`, and the category's shape registered to them."""
-        ends = self.found_states(limits[:, None]).T.sort()[0]
+        ends = self.found_states(limits[:, None].to(self.found)).T.sort()[0]
         views, found = scans.views(num_points, generator, count, ends)
         return views, replace(found, shape=self.shape, base=found.base @ self.frame, state=self.states(found.state))
 
@@ -85,6 +85,12 @@ class ScanSpace:
     def states(self, found: Tensor) -> Tensor:
         """The other way."""
         return self.state + self.sense * (found - self.found)
+
+
+def _beside(shape: ArticulatedShape, found: Tensor) -> ArticulatedShape:
+    """The same where discovery works, which is on the CPU."""
+    joints = replace(shape.joints, axis=shape.joints.axis.to(found), pivot=shape.joints.pivot.to(found))
+    return replace(shape, points=shape.points.to(found), label=shape.label.to(found.device), joints=joints)
 
 
 def _posed(

@@ -42,7 +42,7 @@ def test_the_categorys_shape_is_where_it_is_in_views(module, monkeypatch):
     space = ScanSpace.of(module.shape, scans.found, module.states.starts())
     limits = torch.tensor([ZERO, SEEN[0]])
     views, found = space.views(scans, POINTS, np.random.default_rng(0), 3, limits)
-    assert found.shape is module.shape and len(views) == len(found.base) == len(found.state)
+    assert torch.equal(found.shape.points, module.shape.points) and len(views) == len(found.base) == len(found.state)
     assert found.state.min() > ZERO - 0.05 and found.state.max() < SEEN[0] + 0.05 and found.state.std() > 0.15
     size = torch.linspace(0.5, 2.5, 101)  # by which views are normalised
     for one, view in enumerate(views):
