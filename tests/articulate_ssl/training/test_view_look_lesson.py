@@ -60,7 +60,7 @@ def test_four_quarters_of_every_view_are_taught_and_the_first_stands(module, mon
     assert 0 < (noisy - views).norm(dim=-1).mean() < 0.02
     # Up is the same in all four, and each is a quarter farther about it.
     up = frames @ AXES[1]
-    torch.testing.assert_close(up, torch.tensor([0.0, -1.0, 0.0]).expand_as(up), atol=0.004, rtol=0)
+    torch.testing.assert_close(up, torch.tensor([0.0, -1.0, 0.0]).expand_as(up), atol=0.01, rtol=0)
     relative = frames[:, :1].mT @ frames
     cosine = (relative.diagonal(dim1=-2, dim2=-1).sum(dim=-1) - 1) / 2
     torch.testing.assert_close(cosine, torch.tensor([1.0, 0.0, -1.0, 0.0]).expand(count, 4), atol=1e-5, rtol=0)
@@ -97,7 +97,7 @@ def test_where_nothing_lies_simulated_views_say_which_way_is_up(module, monkeypa
     camera = module.estimator.box_turns.camera
     assert camera.learnt and torch.equal(camera.up, torch.tensor([0.0, 1.0, 0.0]))
     up = asked[0][1] @ AXES[1]
-    torch.testing.assert_close(up, torch.tensor([0.0, -1.0, 0.0]).expand_as(up), atol=0.004, rtol=0)
+    torch.testing.assert_close(up, torch.tensor([0.0, -1.0, 0.0]).expand_as(up), atol=0.01, rtol=0)
     module.estimator.hinge_sides.camera.learnt.fill_(True)
     learn_view_looks(module, None)
     assert not camera.learnt  # one of them is enough
