@@ -17,6 +17,7 @@ import roma
 import torch
 from torch import Tensor
 
+from articulate_ssl.discovery.discover import DiscoveryError
 from articulate_ssl.inference.box_turns import VIEW_POINTS
 from articulate_ssl.inference.upright_camera import UprightCamera
 from articulate_ssl.ops.progress import tell
@@ -63,7 +64,11 @@ def learn_view_looks(
     random, each = np.random.default_rng(0), module.view_looks_samples / len(scans.clouds)
     shown, bases = [], []
     for limits, share in ((nearly_closed(states), _CLOSED), (states.known[0], 1 - _CLOSED)):
-        views, found = space.views(scans, VIEW_POINTS, random, math.ceil(share * each), limits)
+        try:
+            views, found = space.views(scans, VIEW_POINTS, random, math.ceil(share * each), limits)
+        except DiscoveryError:
+            log.warning("how views look: no view shows %d points of the scans, take denser ones", VIEW_POINTS)
+            return
         shown.append(views)
         bases.append(found.base)
     views, base = torch.cat(shown).to(module.device), torch.cat(bases).to(module.device)

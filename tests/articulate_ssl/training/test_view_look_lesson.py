@@ -118,3 +118,9 @@ def test_few_views_teach_nothing(module, monkeypatch):
     module.view_looks_samples = 100
     learn_view_looks(module, None)
     assert module.asked == 1 and not module.estimator.box_turns.learnt
+
+
+def test_scans_of_few_points_teach_nothing(module, monkeypatch, caplog):
+    monkeypatch.setattr(view_look_lesson, "VIEW_POINTS", 5000)
+    learn_view_looks(module, None)
+    assert not module.estimator.box_turns.learnt and "take denser ones" in caplog.text
