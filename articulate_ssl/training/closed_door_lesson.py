@@ -47,11 +47,10 @@ def learn_closed_doors(
     if states.showed(states.rest.new_tensor([closed]), _SEEN):
         tell(log, "closed doors: training shows them")
         return
-    scans = module.recipe.standing_scans(data, module.num_points)
-    space = ScanSpace.of(shape, scans.found, states.starts())
-    if space is None:
-        log.warning("closed doors: discovery found the hinge elsewhere than it is now: there are no views of them")
+    known = ScanSpace.of_scans(module, data, "closed doors")
+    if known is None:
         return
+    scans, space = known
     states.set_rest(closed)
     count = math.ceil(module.closed_views_samples / len(scans.clouds))
     limits = nearly_closed(states)

@@ -6,8 +6,10 @@ elsewhere, or in the other sense. The category's shape, registered to what was f
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -19,12 +21,18 @@ from articulate_ssl.discovery.registration import register_articulated
 from articulate_ssl.discovery.search import search_articulated
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
+from articulate_ssl.training.set_clouds import SetClouds
+
+if TYPE_CHECKING:
+    from articulate_ssl.training.module import ArticulatedPoseModule
 
 # Degrees and length by which hinges differ at most, of a shape and of what discovery found, or found once more. Chosen:
 # training moves them by about one degree and a hundredth.
 _ANGLE, _APART = 10.0, 0.1
 _OF_PART = 300  # points by which shapes are registered
 _FINER, _ROUNDS = (0.03, 0.003), 20  # scales of that after the search
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -77,6 +85,17 @@ class ScanSpace:
         ends = self.found_states(limits[:, None].to(self.found)).T.sort()[0]
         views, found = scans.views(num_points, generator, count, ends)
         return views, replace(found, shape=self.shape, base=found.base @ self.frame, state=self.states(found.state))
+
+    @staticmethod
+    def of_scans(module: ArticulatedPoseModule, data: SetClouds, lesson: str) -> tuple[StandingScans, ScanSpace] | None:
+        """The scans that taught a module views, and where its category is in them; None, and a warning, if nowhere."""
+        scans, category = module.recipe.standing_scans(data, module.num_points), module.articulated.category
+        shape = category.articulated_shape(module.articulated.joint_type)
+        space = ScanSpace.of(shape, scans.found, module.states.starts())
+        if space is None:
+            log.warning("%s: discovery found the hinge elsewhere than it is now: there are no views of them", lesson)
+            return None
+        return scans, space
 
     def found_states(self, state: Tensor) -> Tensor:
         """Joint states of the category, as what was found counts them."""

@@ -55,12 +55,10 @@ def learn_view_looks(
         tell(log, "how views look: it is not known which way is up, or how closed doors look")
         return
     estimator.other_views.measure()
-    scans = module.recipe.standing_scans(data, module.num_points)
-    shape = module.articulated.category.articulated_shape(module.articulated.joint_type)
-    space = ScanSpace.of(shape, scans.found, states.starts())
-    if space is None:
-        log.warning("how views look: discovery found the hinge elsewhere than it is now")
+    known = ScanSpace.of_scans(module, data, "how views look")
+    if known is None:
         return
+    scans, space = known
     random, each = np.random.default_rng(0), module.view_looks_samples / len(scans.clouds)
     shown, bases = [], []
     for limits, share in ((nearly_closed(states), _CLOSED), (states.known[0], 1 - _CLOSED)):
@@ -72,7 +70,7 @@ def learn_view_looks(
         shown.append(views)
         bases.append(found.base)
     views, base = torch.cat(shown).to(module.device), torch.cat(bases).to(module.device)
-    turns.axes.copy_(estimator.part_frames.axes[shape.joints.chain.root])
+    turns.axes.copy_(estimator.part_frames.axes[space.shape.joints.chain.root])
     frames, stands = _quarter_turned(base[:, :3, :3], camera, turns.axes)
     generator = torch.Generator().manual_seed(0)
     order = torch.randperm(len(views), generator=generator).to(views.device)
