@@ -47,8 +47,9 @@ def as_prediction(
         part_id=probability.argmax(dim=-1),
         part_probability=probability,
         part_pose=part_pose,
-        part_shape=chosen.part_shape,
-        assembly=chosen.assembly,
+        # The category's own are views of parameters, which ask for gradients even where none are taken.
+        part_shape=chosen.part_shape.detach(),
+        assembly=chosen.assembly.detach(),
         base_pose=chosen.base[:, 0],
         joint_parent=parent.expand(shape),
         joint_child=torch.tensor(chain.child, device=points.device).expand(shape),
