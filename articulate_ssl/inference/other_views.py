@@ -7,12 +7,12 @@ are right then (docs/experiments.md, step 246). So both are always sought, where
 Training shows doors that are open, and users scan closed ones, which no view was like: another side of a box was taken
 for an open door. But scans show whole objects, and a door whose hinge is known can be closed in them before they are
 seen by a camera (`training/closed_door_lesson.py`). Such views are sought, too, apart from the others, which stay as
-they were, and are believed where they explain a cloud clearly better (docs/experiments.md, step 279).
+they were, and are believed where they explain a cloud clearly better (docs/experiments.md, step 279), or about as well
+as what no joint does (step 294).
 
 A closed box still fits as well with another of its sides for the door. What it looks like says more (`box_turns`), if
 that was taught: where a door is as training did not show it, and the box looks clearly righter in another way, it is
-explained in that way, however that fits (step 289); and where a door is as training showed it, but another is about as
-likely, if that fits about as well (step 293).
+explained in that way (step 289).
 """
 
 from __future__ import annotations
@@ -31,9 +31,6 @@ from articulate_ssl.inference.upright_camera import UprightCamera
 from articulate_ssl.inference.view_search import Seen, ViewSearch
 from articulate_ssl.inference.votes import Votes
 from articulate_ssl.network.hypotheses import Hypotheses
-
-# How much worse than by a door as training showed it an explanation may fit that looks right. Chosen (step 293).
-_ABOUT = 1.1
 
 
 class OtherViews:
@@ -73,37 +70,25 @@ class OtherViews:
         if not kinds:
             return one, rival, margin, votes
         contest, states = Contest(one, rival, margin, final.distance(one, points)), final.registration.states
-        closed = torch.full_like(margin, torch.inf)  # least error of what is explained with a door as training did not
         said = [views.search(points, shown=shown) for views, _, shown in kinds]
         for (views, lying, _), seen, tried in zip(kinds, said, self._fitted(said, points, dense), strict=True):
             error, likely = final.distance(tried, points), states.contains(tried.state[:, 0])
             if lying is not None:
                 likely &= (self.camera.stood(tried.base[:, 0, :3, :3])[1] > 0) == lying
             known, least = states.contains(contest.one.state[:, 0]), CLEARLY if views is self.closed else 1.0
-            closed = torch.where(likely & ~states.showed(tried.state[:, 0]), closed.minimum(error), closed)
             contest, rows = contest.against(tried, error, likely, torch.where(known, least, ABOUT_AS_WELL))
             votes = votes._replace(share=votes.share.index_copy(0, rows, seen.votes.share[rows]))
         if self.turns.learnt and dense is not None:
-            showed = states.showed(contest.one.state[:, 0])
-            asked = (~showed | (closed < _ABOUT * contest.error)).nonzero()[:, 0]
-            least = torch.where(showed, _ABOUT, torch.inf)
-            contest, votes = self._looking_right(contest, votes, points, dense, asked, least)
+            contest, votes = self._looking_right(contest, votes, points, dense)
         return contest.one, contest.rival, contest.margin, votes
 
-    def _looking_right(
-        self,
-        contest: Contest,
-        votes: Votes,
-        points: Tensor,  # [B, N, 3]
-        dense: Tensor,  # [B, P, 3]
-        rows: Tensor,  # which of the clouds, whose doors may be as training did not show them
-        least: Tensor,  # [B] of what is decided for, its share that the other's error has to be below
-    ) -> tuple[Contest, Votes]:
-        """What is explained in a way that looks wrong gives way to what looks right.
+    def _looking_right(self, contest: Contest, votes: Votes, points: Tensor, dense: Tensor) -> tuple[Contest, Votes]:
+        """What is explained with a door as training did not show it gives way to what looks right, however either fits.
 
         Of what stands so in all views and in those of closed doors the one that fits better.
         """
         final, states = self.final, self.final.registration.states
+        rows = (~states.showed(contest.one.state[:, 0])).nonzero()[:, 0]
         if not len(rows):
             return contest, votes
         frames, angle = manhattan_frames(dense[rows], torch.Generator().manual_seed(0))
@@ -121,7 +106,7 @@ class OtherViews:
             likely = torch.zeros_like(won).index_copy(0, rows, right & states.contains(tried.state[:, 0]))
             error = torch.full_like(contest.error, torch.inf).index_copy(0, rows, final.distance(tried, own))
             everywhere = contest.one.with_rows(rows, tried)
-            contest, better = contest.against(everywhere, error, likely, torch.where(won, 1.0, least))
+            contest, better = contest.against(everywhere, error, likely, torch.where(won, 1.0, torch.inf))
             won = won.index_fill(0, better, True)
             share = votes.share.index_copy(0, rows, seen.votes.share)
             votes = votes._replace(share=votes.share.index_copy(0, better, share[better]))
