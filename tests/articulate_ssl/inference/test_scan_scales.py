@@ -26,12 +26,12 @@ def _by_its_faces(estimator):
 
 
 @pytest.mark.parametrize("learnt", [None, _by_relief, _by_a_network, _by_its_door, _by_its_faces])
-def test_what_reads_all_points_gets_all_points(learnt, monkeypatch):
+def test_what_reads_all_points_gets_all_points_and_takes_proportions_by_these_alone(learnt, monkeypatch):
     estimator, plain, asked = tiny_module().eval().estimator, tiny_module().eval().estimator, []
     predict = PoseEstimator.predict_with_rivals
 
-    def told(_self, points, num_points, _refine=None, dense=None):
-        asked.append((len(points), None if dense is None else dense.shape[1]))
+    def told(_self, points, num_points, _refine=None, dense=None, fits=True):
+        asked.append((len(points), None if dense is None else dense.shape[1], fits))
         return predict(plain, points, num_points, False)
 
     if learnt is not None:
@@ -39,5 +39,6 @@ def test_what_reads_all_points_gets_all_points(learnt, monkeypatch):
     monkeypatch.setattr(PoseEstimator, "predict_with_rivals", told)
     scan = np.random.default_rng(0).random((5 * POINTS, 3))
     predict_scans(estimator, [scan], POINTS, (0.3, 0.02))
-    expected = [(len(SCALE_STARTS), None)]
-    assert asked == (expected if learnt is None else [*expected, (1, 5 * POINTS)])
+    scales = len(SCALE_STARTS)
+    expected = [(scales, None, True)] if learnt is None else [(scales, None, False), (1, 5 * POINTS, True)]
+    assert asked == expected
