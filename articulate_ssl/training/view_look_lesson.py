@@ -19,6 +19,7 @@ from torch import Tensor
 
 from articulate_ssl.discovery.discover import DiscoveryError
 from articulate_ssl.inference.box_turns import VIEW_POINTS
+from articulate_ssl.inference.hinge_sides import HingeSides
 from articulate_ssl.inference.upright_camera import UprightCamera
 from articulate_ssl.ops.progress import tell
 from articulate_ssl.training.closed_door_lesson import nearly_closed
@@ -48,9 +49,11 @@ def learn_view_looks(
     turns, camera = estimator.box_turns, estimator.hinge_sides.camera
     turns.surface = None  # of a run that ended and goes on
     turns.camera.forget()
-    if not camera.learnt:
-        camera = turns.camera
-        camera.learn(estimator.view_search.base[:, :3, :3], estimator.hinge_sides.axes)
+    if not camera.learnt:  # no object lies, and nobody has asked where the door's normal points
+        sides, camera = HingeSides().to(module.device), turns.camera
+        shape = module.articulated.category.articulated_shape(module.articulated.joint_type)
+        sides.measure(shape, states.known, estimator.part_frames)
+        camera.learn(estimator.view_search.base[:, :3, :3], sides.axes)
     if not (camera.learnt and estimator.closed_views.learnt):
         tell(log, "how views look: it is not known which way is up, or how closed doors look")
         return
