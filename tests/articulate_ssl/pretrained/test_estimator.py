@@ -89,9 +89,9 @@ def test_a_batch_goes_through_together_and_is_predicted_as_one_by_one(folder, cl
     alone = [estimator.predict(one) for one in clouds]
     sizes, predict = [], PoseEstimator.predict_with_rivals
 
-    def counted(self, points, *arguments):
+    def counted(self, points, *arguments, **options):
         sizes.append(len(points) // len(scan_scales.SCALE_STARTS))
-        return predict(self, points, *arguments)
+        return predict(self, points, *arguments, **options)
 
     monkeypatch.setattr(PoseEstimator, "predict_with_rivals", counted)
     monkeypatch.setattr(scan_scales, "_SCANS_AT_ONCE", 3)
