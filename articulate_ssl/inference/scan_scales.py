@@ -29,8 +29,8 @@ def predict_scans(
     """Predict scans of unknown scale: of several within the training clouds' range, the best reconstruction wins.
 
     `_SCANS_AT_ONCE` go through networks and registration together, and one's prediction does not depend on others.
-    What is predicted once more, by all points, takes its proportions then: scales are told apart as well without
-    (docs/experiments.md, step 295).
+    What is predicted once more, by all points, takes its proportions then: scales are told apart as well without, but
+    where doors may be closed (docs/experiments.md, step 295).
 
     Args:
         num_points: See `PoseEstimator.predict`; registration reads as many as the options say.
@@ -61,12 +61,13 @@ def _predict_together(
         scales.append([size / start for start in starts])
         tried += [torch.as_tensor(cloud / scale, dtype=torch.float32) for scale in scales[-1]]
     batch, again = torch.stack(tried).to(device), estimator.reads_dense
+    fits = not again or estimator.closed_views.learnt
     if estimator.sliding.learnt:  # which reads all points of a scan
         copies = [_scaled(*scan).to(batch) for scan in zip(clouds, centers, scales, strict=True)]
         both = zip(batch.split(len(starts)), copies, strict=True)
-        found = [estimator.predict_with_rivals(some, num_points, refine, dense, not again) for some, dense in both]
+        found = [estimator.predict_with_rivals(some, num_points, refine, dense, fits) for some, dense in both]
     else:
-        copies, whole = [None] * len(clouds), estimator.predict_with_rivals(batch, num_points, refine, fits=not again)
+        copies, whole = [None] * len(clouds), estimator.predict_with_rivals(batch, num_points, refine, fits=fits)
         scans = [slice(first, first + len(starts)) for first in range(0, len(batch), len(starts))]
         found = [tuple(one[rows] for one in whole) for rows in scans]
     tried = zip(found, batch.split(len(starts)), copies, centers, scales, strict=True)

@@ -25,7 +25,12 @@ def _by_its_faces(estimator):
     estimator.part_frames.flat.fill_(True)
 
 
-@pytest.mark.parametrize("learnt", [None, _by_relief, _by_a_network, _by_its_door, _by_its_faces])
+def _by_closed_doors(estimator):
+    _by_its_faces(estimator)
+    estimator.closed_views.views = torch.zeros(1, 8, 3, dtype=torch.int8)
+
+
+@pytest.mark.parametrize("learnt", [None, _by_closed_doors, _by_relief, _by_a_network, _by_its_door, _by_its_faces])
 def test_what_reads_all_points_gets_all_points_and_takes_proportions_by_these_alone(learnt, monkeypatch):
     estimator, plain, asked = tiny_module().eval().estimator, tiny_module().eval().estimator, []
     predict = PoseEstimator.predict_with_rivals
@@ -40,5 +45,5 @@ def test_what_reads_all_points_gets_all_points_and_takes_proportions_by_these_al
     scan = np.random.default_rng(0).random((5 * POINTS, 3))
     predict_scans(estimator, [scan], POINTS, (0.3, 0.02))
     scales = len(SCALE_STARTS)
-    expected = [(scales, None, True)] if learnt is None else [(scales, None, False), (1, 5 * POINTS, True)]
+    expected = [(scales, None, True)] if learnt is None else [(scales, None, learnt is _by_closed_doors), (1, 5 * POINTS, True)]
     assert asked == expected
