@@ -31,7 +31,9 @@ def _by_closed_doors(estimator):
 
 
 @pytest.mark.parametrize("learnt", [None, _by_closed_doors, _by_relief, _by_a_network, _by_its_door, _by_its_faces])
-def test_what_reads_all_points_gets_all_points_and_takes_proportions_by_these_alone(learnt, monkeypatch):
+def test_what_reads_all_points_gets_all_points_and_takes_proportions_by_these_alone_unless_doors_may_be_closed(
+    learnt, monkeypatch
+):
     estimator, plain, asked = tiny_module().eval().estimator, tiny_module().eval().estimator, []
     predict = PoseEstimator.predict_with_rivals
 
@@ -44,6 +46,5 @@ def test_what_reads_all_points_gets_all_points_and_takes_proportions_by_these_al
     monkeypatch.setattr(PoseEstimator, "predict_with_rivals", told)
     scan = np.random.default_rng(0).random((5 * POINTS, 3))
     predict_scans(estimator, [scan], POINTS, (0.3, 0.02))
-    scales = len(SCALE_STARTS)
-    expected = [(scales, None, True)] if learnt is None else [(scales, None, learnt is _by_closed_doors), (1, 5 * POINTS, True)]
-    assert asked == expected
+    first = len(SCALE_STARTS), None, learnt in (None, _by_closed_doors)
+    assert asked == ([first] if learnt is None else [first, (1, 5 * POINTS, True)])
