@@ -7,8 +7,8 @@ are right then (docs/experiments.md, step 246). So both are always sought, where
 Training shows doors that are open, and users scan closed ones, which no view was like: another side of a box was taken
 for an open door. But scans show whole objects, and a door whose hinge is known can be closed in them before they are
 seen by a camera (`training/closed_door_lesson.py`). Such views are sought, too, apart from the others, which stay as
-they were, and are believed where they explain a cloud clearly better (docs/experiments.md, step 279), or about as well
-as what no joint does (step 294).
+they were, and are believed where they explain a cloud clearly better (docs/experiments.md, step 279). What no joint
+does gives way to what any view says within the joint's limits, if that fits about as well (step 294).
 
 A closed box still fits as well with another of its sides for the door. What it looks like says more (`box_turns`), if
 that was taught: where a door is as training did not show it, and the box looks clearly righter in another way, it is
