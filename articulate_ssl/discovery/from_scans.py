@@ -44,12 +44,14 @@ class StandingScans:
 
     Attributes:
         clouds: [m, P, 3] of objects, and of their mirror images.
+        source: [m] which of the scans each is; -1 for what is in the mirror.
         found: The category's shape registered to them.
         turns: [m, V, 3, 3] canonical object space -> camera, of V views of each.
         mean_distance: Of a view's points to their centre.
     """
 
     clouds: Tensor
+    source: Tensor
     found: RegisteredShape
     turns: Tensor
     mean_distance: float
@@ -99,9 +101,10 @@ def discover_from_scans(
     best = _likeliest(found, clouds)[: options.kept(len(clouds))]
     random, generator = np.random.default_rng(options.seed), torch.Generator().manual_seed(options.seed)
     mean_distance = float((views - views.mean(dim=1, keepdim=True)).norm(dim=-1).mean())
-    quarters = torch.zeros(len(clouds), dtype=torch.long)
+    quarters, source = torch.zeros(len(clouds), dtype=torch.long), torch.arange(len(clouds))
     if orientation.limited:
         count, clouds = len(clouds), torch.cat([clouds, _in_the_mirror(found, clouds)])
+        source = torch.cat([source, torch.full_like(source, -1)])
         found = found.of_clouds(torch.arange(count).repeat(2))
         quarters, lying = to_stand(found, clouds, best)
         quarters[count:][quarters[:count] == 0] = 0  # what stands is as seen in scans
@@ -118,7 +121,7 @@ def discover_from_scans(
         turns = turns @ (stand.mean @ lying[kept].mT @ stand.mean.mT)[:, None]
     found, clouds = replace(found.of_clouds(kept), quarters=quarters[kept]), clouds[kept]
     _announce(1, "views of the scans")
-    standing = StandingScans(clouds, found, turns.reshape(len(kept), _VIEWS, 3, 3), mean_distance)
+    standing = StandingScans(clouds, source[kept], found, turns.reshape(len(kept), _VIEWS, 3, 3), mean_distance)
     simulated = standing.views(num_points, random)
     _announce(2, "done")
     return *simulated, standing

@@ -20,6 +20,7 @@ from articulate_ssl.discovery.one_object.surface import Surface
 from articulate_ssl.discovery.registered_shape import RegisteredShape
 from articulate_ssl.geometry.se3 import invert_se3
 from articulate_ssl.ops.chamfer import nearest_index
+from articulate_ssl.shape.joints import Joints
 from articulate_ssl.shape.object_axes import object_axes
 from articulate_ssl.shape.part_maps import PartMaps
 
@@ -42,17 +43,12 @@ class Reshaping:
         clouds: [n, P, 3].
 
     Attributes:
-        point_part: [n, P] which part every point belongs to: what the registration says, else the nearest of the
-            registered shape's, in its proportions.
+        point_part: [n, P] `point_parts`.
     """
 
     def __init__(self, found: RegisteredShape, clouds: Tensor) -> None:
-        own = found.axes, found.log_stretch, found.beside
-        fit = InstanceFit(found.shape, found.base, found.state, torch.Generator(), *own)
-        self._found, self._points, self._joints = found, clouds, fit.instances().joints
-        self.point_part = found.point_part
-        if found.point_part is None:
-            self.point_part = found.shape.label[nearest_index(clouds, fit.posed())]
+        self._found, self._points, self._joints = found, clouds, instance_joints(found)
+        self.point_part = point_parts(found, clouds)
         self._axes = object_axes(found.shape)
         normals = [Surface.of(cloud).normals for cloud in clouds.double().numpy()]
         self._normals = torch.from_numpy(np.stack(normals)).to(clouds)
@@ -95,6 +91,24 @@ class Reshaping:
         points = torch.einsum("npij,npj->npi", _by_point(maps.linear, self.point_part), self._points)
         points = points + _by_point(maps.shift, self.point_part)
         return Reshaped(points, functional.normalize(normals, dim=-1), state)
+
+
+def point_parts(found: RegisteredShape, clouds: Tensor) -> Tensor:  # [n, P]
+    """Which part points are of: what the registration says, else the nearest of the shape's, as it is there."""
+    if found.point_part is not None:
+        return found.point_part
+    return found.shape.label[nearest_index(clouds, _fit(found).posed())]
+
+
+def instance_joints(found: RegisteredShape) -> Joints:
+    """Joints in canonical object space, [n, J, 3] each, in the proportions of the clouds."""
+    joints = _fit(found).instances().joints
+    return replace(joints, axis=joints.axis.expand_as(joints.pivot))
+
+
+def _fit(found: RegisteredShape) -> InstanceFit:
+    own = found.axes, found.log_stretch, found.beside
+    return InstanceFit(found.shape, found.base, found.state, torch.Generator(), *own)
 
 
 def _by_point(of_part: Tensor, label: Tensor) -> Tensor:

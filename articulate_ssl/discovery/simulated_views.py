@@ -106,7 +106,7 @@ def _view(surface: Surface, mean_distance: float, generator: np.random.Generator
     """Of a camera at the origin that looks along z at the middle of the cloud."""
     shift = in_front(surface.points, generator.uniform(*DISTANCE))
     placed = surface.points + shift
-    seen = seen_from_origin(placed)
+    seen = seen_from_origin(placed, surface.normals)
     points, normals = placed[seen], surface.normals[seen]
     distance = np.linalg.norm(points, axis=1)
     pixels = np.abs((normals * points).sum(axis=1)) / distance**3  # of a patch of surface: its solid angle

@@ -169,17 +169,21 @@ class PartFrames(LateBuffers):
         one: Hypotheses,  # H = 1
         dense: Tensor,  # [B, P, 3]
         afar: bool = False,
+        part: Tensor | None = None,  # [B, P]
     ) -> tuple[Hypotheses, tuple[Tensor, Tensor]]:  # H = 1, ([B], [B, J])
         """Explanations turned as the faces of clouds say, and whether they do: of the whole, and of every joint.
 
         Faces turn the whole by at most 20 degrees, and joints likewise; `afar` joints by up to 45, if nothing nearer is
         square to them: whoever asks for that has to see whether it explains the cloud.
+
+        Args:
+            part: Which one points are of, where that is known; None: the one that is nearest.
         """
         axis = torch.where(self.measured[:, None], self.direction, one.axis)
         one = replace(one, structure=replace(one.structure, axis=axis))
         windows = [WINDOWS[int(wide)] for wide in self.wide]
-        one, turned = self._root_squared(one, faces_of(one, dense, windows).of(one.chain.root))
-        one, moved = self._joints_squared(one, faces_of(one, dense, windows), afar)
+        one, turned = self._root_squared(one, faces_of(one, dense, windows, part).of(one.chain.root))
+        one, moved = self._joints_squared(one, faces_of(one, dense, windows, part), afar)
         return one, (turned, moved)
 
     def _lie(
@@ -281,13 +285,15 @@ def faces_of(
     one: Hypotheses,  # H = 1
     dense: Tensor,  # [B, P, 3]
     windows: Sequence[float],  # of every part
+    part: Tensor | None = None,  # [B, P]
 ) -> Faces:
-    """Normals of clouds, by the part of their explanations that is nearest."""
-    posed = one.posed()[:, 0]
-    nearest = torch.stack([nearest_distance(dense, posed[:, k]) for k in range(posed.shape[1])]).argmin(dim=0)
+    """Normals of clouds, by the part that points are of, or else by that of their explanations that is nearest."""
+    if part is None:
+        posed = one.posed()[:, 0]
+        part = torch.stack([nearest_distance(dense, posed[:, k]) for k in range(posed.shape[1])]).argmin(dim=0)
     found = [
-        [_normals(cloud[part == k], window) for k, window in enumerate(windows)]
-        for cloud, part in zip(dense, nearest, strict=True)
+        [_normals(cloud[own == k], window) for k, window in enumerate(windows)]
+        for cloud, own in zip(dense, part, strict=True)
     ]
     normal, weight = (
         torch.stack([torch.stack(parts) for parts in some])

@@ -18,6 +18,7 @@ from torch import Tensor
 from articulate_ssl.discovery.from_scans import StandingScans
 from articulate_ssl.discovery.registered_shape import RegisteredShape
 from articulate_ssl.discovery.registration import register_articulated
+from articulate_ssl.discovery.reshaping import point_parts
 from articulate_ssl.discovery.search import search_articulated
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 _ANGLE, _APART = 10.0, 0.1
 _OF_PART = 300  # points by which shapes are registered
 _FINER, _ROUNDS = (0.03, 0.003), 20  # scales of that after the search
+_AT_ONCE = 16  # scans whose faces are looked at
 
 log = logging.getLogger(__name__)
 
@@ -95,7 +97,23 @@ class ScanSpace:
         if space is None:
             log.warning("%s: discovery found the hinge elsewhere than it is now: there are no views of them", lesson)
             return None
-        return scans, space
+        state = space.square_states(scans, module)
+        return replace(scans, found=replace(scans.found, state=state)), space
+
+    def square_states(self, scans: StandingScans, module: ArticulatedPoseModule) -> Tensor:  # [n, 1]
+        """Joint states of scans, as what was found counts them, in which parts are square to their faces.
+
+        Registration turns a door to where it fits best, and in an object of other proportions than the shape's that is
+        a few degrees off. Closed by its own state it would gape then, or lie within the body, and views would show
+        what no closed door shows.
+        """
+        base, state = (scans.found.base @ self.frame)[:, None], self.states(scans.found.state)[:, None]
+        part, squared = point_parts(scans.found, scans.clouds), []
+        for rows in torch.arange(len(base)).split(_AT_ONCE):
+            dense, own = scans.clouds[rows].to(module.device), part[rows].to(module.device)
+            placed = module.articulated.category_at(base[rows].to(module.device), state[rows].to(module.device))
+            squared.append(module.part_frames.settled(placed, dense, part=own)[0].state[:, 0])
+        return self.found_states(torch.cat(squared).to(scans.found.state))
 
     def found_states(self, state: Tensor) -> Tensor:
         """Joint states of the category, as what was found counts them."""

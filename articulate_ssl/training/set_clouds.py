@@ -27,14 +27,14 @@ class SetClouds:
         """A fixed subset of the training clouds [n, N, 3]."""
         return _points(self.data.discovery_dataloader(count))
 
-    def scans(self, count: int) -> Tensor:
-        """The same of complete clouds.
+    def scans(self, count: int) -> tuple[Tensor, Tensor]:
+        """The same of complete clouds, and which object each shows [n].
 
         Raises:
             ValueError: if there are none.
         """
         self._refuse_views()
-        return _points(self.data.discovery_dataloader(count, scans=True))
+        return _with_objects(self.data.discovery_dataloader(count, scans=True))
 
     def objects(self, count: int) -> tuple[Tensor, Tensor]:
         """Scans of whole objects [n, N, 3], and which object each shows [n].
@@ -43,8 +43,7 @@ class SetClouds:
             ValueError: if there are no complete clouds.
         """
         self._refuse_views()
-        batches = list(self.data.discovery_dataloader(count, (MIN_CLOUDS, MOST_CLOUDS), scans=True))
-        return _points(batches), torch.cat([batch["instance"] for batch in batches])
+        return _with_objects(self.data.discovery_dataloader(count, (MIN_CLOUDS, MOST_CLOUDS), scans=True))
 
     def _refuse_views(self) -> None:
         if self.data.manifest.view != "complete" and self.data.hparams.scans is None:
@@ -52,6 +51,11 @@ class SetClouds:
                 f"discovery.grouped needs complete clouds, and {self.data.folder} holds depth views: name a set of "
                 "complete clouds of such objects in several states with --data.scans, or leave grouped out"
             )
+
+
+def _with_objects(batches) -> tuple[Tensor, Tensor]:
+    batches = list(batches)
+    return _points(batches), torch.cat([batch["instance"] for batch in batches])
 
 
 def _points(batches) -> Tensor:

@@ -5,7 +5,8 @@ from types import SimpleNamespace
 
 import roma
 import torch
-from boxes_with_doors import ZERO, box_shape
+from boxes_with_doors import HINGE, ZERO, box_shape
+from true_category import Category
 
 from articulate_ssl.discovery.from_scans import StandingScans
 from articulate_ssl.discovery.registered_shape import RegisteredShape
@@ -29,7 +30,7 @@ def scanned_boxes() -> StandingScans:
     clouds, part = clouds[:, order], shape.label[order].expand(COUNT, -1)
     found = replace(found, point_part=part, quarters=torch.arange(COUNT) % 2)
     turns = roma.special_procrustes(torch.randn(COUNT, 9, 3, 3, generator=generator))
-    return StandingScans(clouds, found, turns, 0.3)
+    return StandingScans(clouds, torch.arange(COUNT), found, turns, 0.3)
 
 
 def found_elsewhere(scans: StandingScans, frame: torch.Tensor) -> StandingScans:
@@ -47,6 +48,9 @@ def module_of_boxes() -> SimpleNamespace:
     states, frames, shape = StateRange(1), PartFrames(2), box_shape()
     states.seen.copy_(torch.tensor([SEEN]))
     frames.flat.fill_(True)
+    frames.axes[1] = roma.rotvec_to_rotmat(-ZERO * HINGE)  # the door, which is closed at ZERO
+    frames.measured.fill_(True)
+    frames.direction.copy_(HINGE)
     made = SimpleNamespace(states=states, part_frames=frames, num_points=POINTS, closed_views_samples=20, asked=0)
     made.scans = scanned_boxes()
 
@@ -55,8 +59,11 @@ def module_of_boxes() -> SimpleNamespace:
         assert num_points == POINTS
         return made.scans
 
+    parts = torch.cat([(shape.label == part).nonzero()[:200, 0] for part in range(2)])
+    even = Category(replace(shape, points=shape.points[parts], label=shape.label[parts]))
     made.recipe = SimpleNamespace(standing_scans=standing_scans)
     made.estimator = SimpleNamespace(closed_views=ViewSearch(2), part_frames=frames)
     category = SimpleNamespace(articulated_shape=lambda _: made.shape)
-    made.shape, made.articulated = shape, SimpleNamespace(category=category, joint_type=REVOLUTE)
+    made.shape, made.device = shape, torch.device("cpu")
+    made.articulated = SimpleNamespace(category=category, joint_type=REVOLUTE, category_at=even.category_at)
     return made

@@ -41,8 +41,11 @@ class TrainingClouds(Protocol):
     def clouds(self, count: int) -> Tensor:
         """So many of them [n, N, 3], with all their points."""
 
-    def scans(self, count: int) -> Tensor:
-        """So many complete clouds [n, N, 3]: the same, or where these are depth views, scans of their category."""
+    def scans(self, count: int) -> tuple[Tensor, Tensor]:
+        """So many complete clouds [n, N, 3]: the same, or where these are depth views, scans of their category.
+
+        And which object each shows [n], as `objects` names them.
+        """
 
     def objects(self, count: int) -> tuple[Tensor, Tensor]:
         """About as many scans of whole objects [n, N, 3], and which object each shows [n]."""

@@ -21,6 +21,7 @@ from articulate_ssl.discovery.discover import discover
 from articulate_ssl.discovery.from_scans import StandingScans, discover_from_scans
 from articulate_ssl.discovery.grouped import discover_grouped
 from articulate_ssl.discovery.one_object.find import MIN_CLOUDS
+from articulate_ssl.discovery.own_scans import by_own_scans
 from articulate_ssl.discovery.parallel_axes import with_parallel_axes
 from articulate_ssl.discovery.proposals import load_proposals
 from articulate_ssl.discovery.registered_shape import RegisteredShape
@@ -37,6 +38,7 @@ from articulate_ssl.training.recipes.recipe import Outcome, Recipe, TrainingClou
 
 # Registration that teaches, in every step: shorter than at test time. Chosen, not measured.
 _SCALES, _ROUNDS = (0.04, 0.02), 4
+_ALL = 10**6  # scans: more than anybody has
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,8 @@ class TrainingRecipe(Recipe):
             _check_setting(self.estimator.observation)
         self.found: HandOver | None = None
         self._scans: StandingScans | None = None
+        self._shown: Tensor | None = None  # objects of all scans that discovery was given
+        self._hinged: StandingScans | None = None
         self.group = rotation_group(len(self.estimator.articulated.pose_head.elements))
 
     @property
@@ -128,8 +132,8 @@ class TrainingRecipe(Recipe):
             whole = options.objects * MIN_CLOUDS if network.joint_type == PRISMATIC else 0
             objects = data.objects(max(options.clouds, whole))
         if self._simulated:
-            scans = data.scans(options.clouds), *objects
-            found_in = (*scans, *category, observation.orientation, num_points)
+            scans, self._shown = data.scans(options.clouds)
+            found_in = (scans, *objects, *category, observation.orientation, num_points)
             *simulated, scans = discover_from_scans(clouds, *found_in, to_stand=quarters_to_stand)
             self._scans = replace(scans, found=scans.found.in_the_trees_order())
             return tuple(simulated)
@@ -138,11 +142,19 @@ class TrainingRecipe(Recipe):
         return clouds, discover(clouds, *category, observation)
 
     def standing_scans(self, data: TrainingClouds, num_points: int) -> StandingScans:
-        """Scans that taught views, as discovery stood them up; found anew where that was in another run."""
-        if self._scans is None:
+        """Scans that taught views, as discovery stood them up, of one joint with hinges of their own.
+
+        They are found anew where that was in another run.
+        """
+        if self._hinged is None:
             with torch.random.fork_rng(devices=[]):
-                self._discovered(data, num_points)
-        return self._scans
+                if self._scans is None:
+                    self._discovered(data, num_points)
+                scans = self._scans
+                instance = torch.where(scans.source < 0, -1, self._shown[scans.source.clamp(min=0)])
+                shown = scans.clouds, instance, *data.objects(_ALL)
+                self._hinged = replace(scans, found=by_own_scans(scans.found, *shown, self.discovery))
+        return self._hinged
 
     def step(self, points: Tensor, step: int, generator: Callable[[], torch.Generator]) -> Outcome:
         """Warm-up or self-supervision."""

@@ -91,7 +91,7 @@ def test_the_part_of_every_point_is_known(design, reshape, monkeypatch):
 def test_views_of_too_few_points_are_left_out():
     points, found = _registered(LAPTOP)
     turns = OrientationRange(60).draw(len(points), torch.Generator().manual_seed(0))[:, None]
-    few, registered = simulate_views(found, points, turns, 400, 0.3, np.random.default_rng(0))
+    few, registered = simulate_views(found, points, turns, 330, 0.3, np.random.default_rng(0))
     assert 0 < len(few) == len(registered.base) < len(points)
     with pytest.raises(DiscoveryError, match="shows 1000 points"):
         simulate_views(found, points, turns, 1000, 0.3, np.random.default_rng(0))

@@ -12,6 +12,7 @@ from scanned_boxes import POINTS, SEEN, found_elsewhere, module_of_boxes
 from articulate_ssl.discovery import reshaping
 from articulate_ssl.geometry.se3 import se3
 from articulate_ssl.ops.chamfer import nearest_distance
+from articulate_ssl.training import scan_space
 from articulate_ssl.training.scan_space import ScanSpace
 
 
@@ -50,3 +51,14 @@ def test_the_categorys_shape_is_where_it_is_in_views(module, monkeypatch):
         inside = (view - found.base[one, :3, 3]) @ found.base[one, :3, :3]
         off = nearest_distance(inside / size[:, None, None], placed.expand(len(size), -1, -1)).mean(dim=1)
         assert off.min() < 0.01
+
+
+def test_states_are_those_in_which_doors_are_square_to_their_faces(module, monkeypatch):
+    monkeypatch.setattr(scan_space, "_AT_ONCE", 4)  # not all of them at once
+    scans = found_elsewhere(module.scans, se3(torch.eye(3), torch.tensor([0.1, -0.2, 0.05])))
+    wrong = torch.linspace(-12, 12, len(scans.clouds)).deg2rad()[:, None]
+    module.scans = replace(scans, found=replace(scans.found, state=scans.found.state + wrong))
+    squared, _ = ScanSpace.of_scans(module, None, "test")
+    closed = squared.found.state - scans.found.state
+    assert (closed - closed.median()).rad2deg().abs().max() < 2  # the category's zero is where most scans are
+    assert torch.equal(squared.found.base, scans.found.base)

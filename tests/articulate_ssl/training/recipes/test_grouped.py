@@ -123,7 +123,9 @@ def test_views_are_taught_by_scans_of_the_category(tmp_path, monkeypatch):
         assert to_stand is quarters_to_stand
         given["all"] = views, clouds, objects, instance
         given["rest"], given["times"] = rest, given.get("times", 0) + 1
-        standing = StandingScans(clouds, _some_shape(clouds), torch.eye(3).expand(len(clouds), 3, 3, 3), 0.3)
+        standing = StandingScans(
+            clouds, torch.arange(len(clouds)), _some_shape(clouds), torch.eye(3).expand(len(clouds), 3, 3, 3), 0.3
+        )
         return clouds[:4, :POINTS], replace(_some_shape(clouds[:4]), point_part=parts), standing
 
     parts = torch.randint(2, (4, POINTS), generator=torch.Generator().manual_seed(0))
