@@ -38,6 +38,7 @@ from articulate_ssl.shape.observation import Observation
 _OTHERS = 3
 _VOTE = 0.95  # for the part that the shape says a point is of. Chosen.
 _FUSED = 64  # points of each part, of which nothing is made here
+_NEIGHBOURS = 12  # of a point, with itself, that say which part it is of. Chosen.
 _SAME = 1e-4  # by which the distances of a scan's points to their middle differ, however it is turned
 
 log = logging.getLogger(__name__)
@@ -130,4 +131,6 @@ def _of_all(
     cloud: Tensor,  # [P, 3]
     label: Tensor,  # [N] of the leading points
 ) -> Tensor:  # [P]
-    return label[nearest_index(cloud[None], cloud[None, : len(label)].contiguous())[0]]
+    """What most of the points about a point are of: alone among those of another part, it would be seen to fly off."""
+    label = label[nearest_index(cloud[None], cloud[None, : len(label)].contiguous())[0]]
+    return label[torch.cdist(cloud, cloud).topk(_NEIGHBOURS, largest=False).indices].mode(dim=1).values
