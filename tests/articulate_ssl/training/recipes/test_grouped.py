@@ -155,10 +155,24 @@ def test_views_are_taught_by_scans_of_the_category(tmp_path, monkeypatch):
     again = tiny_module(discovery=GROUPED, objective=VIEWS, orientation_range=100.0)
     again.recipe.restore(module.recipe.kept())
     assert torch.equal(again.recipe.found.point_part, parts)
-    # Scans stay at hand; a checkpoint does not keep them, so another run finds them anew.
+    # Scans stay at hand; a checkpoint does not keep them, so another run finds them anew. Their hinges are found once.
+    known = {}
+
+    def by_own_scans(found, clouds, instance, scans, of_object, options):
+        known["times"] = known.get("times", 0) + 1
+        known["all"] = clouds, instance, scans, of_object
+        assert options is module.recipe.discovery or options is again.recipe.discovery
+        return replace(found, state=found.state + 1)
+
+    monkeypatch.setattr(staged, "by_own_scans", by_own_scans)
     data = SetClouds(tiny_data(tmp_path / "views", view="partial", protocol="honest", scans=str(scans)))
     assert torch.equal(module.recipe.standing_scans(data, POINTS).clouds, clouds) and given["times"] == 1
     assert torch.equal(again.recipe.standing_scans(data, POINTS).clouds, clouds) and given["times"] == 2
+    standing = again.recipe.standing_scans(data, POINTS)
+    assert given["times"] == 2 == known["times"] and torch.equal(standing.found.state, _some_shape(clouds).state + 1)
+    shown, instance, every, of_object = known["all"]
+    assert torch.equal(instance, _object_of(tmp_path / "scans", shown))
+    assert torch.equal(of_object, _object_of(tmp_path / "scans", every)) and len(every) > len(shown)
 
 
 def test_scans_of_another_category_or_view_are_refused(tmp_path):
