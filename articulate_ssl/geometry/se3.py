@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 
 def se3(
@@ -31,3 +32,18 @@ def transform_points(
 ) -> Tensor:  # [..., N, 3]
     """Points moved by a pose; leading dimensions broadcast."""
     return points @ pose[..., :3, :3].transpose(-1, -2) + pose[..., None, :3, 3]
+
+
+def rotation_between(
+    source: Tensor,  # [..., 3] unit
+    target: Tensor,  # [..., 3] unit
+) -> Tensor:  # [..., 3, 3]
+    """The smallest rotation that turns `source` onto `target`; some rotation where they are opposite.
+
+    Half a turn about the source, then half a turn about the bisector.
+    """
+
+    def half_turn(axis: Tensor) -> Tensor:
+        return 2 * axis[..., :, None] * axis[..., None, :] - torch.eye(3).to(axis)
+
+    return half_turn(functional.normalize(source + target, dim=-1)) @ half_turn(source)

@@ -16,7 +16,7 @@ from torch.nn import functional
 from articulate_ssl.geometry.directions import icosahedron_directions
 from articulate_ssl.geometry.orientation_range import OrientationRange
 from articulate_ssl.geometry.screw import screw_motion
-from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
+from articulate_ssl.geometry.se3 import invert_se3, rotation_between, se3, transform_points
 from articulate_ssl.network.backbone import EquivariantBackbone
 from articulate_ssl.network.heads.perceptron import perceptron
 from articulate_ssl.network.options import NetworkOptions
@@ -169,21 +169,6 @@ class PartLevel(nn.Module):
         # The sigmoid of the original, centred, is this.
         state = state_bound * (out[..., 6:] / 2).tanh()
         return JointGuess(logits.softmax(dim=-1), out[..., :3], functional.normalize(out[..., 3:6], dim=-1), state)
-
-
-def rotation_between(
-    source: Tensor,  # [..., 3] unit
-    target: Tensor,  # [..., 3] unit
-) -> Tensor:  # [..., 3, 3]
-    """The smallest rotation that turns `source` onto `target`; some rotation where they are opposite.
-
-    Half a turn about the source, then half a turn about the bisector.
-    """
-
-    def half_turn(axis: Tensor) -> Tensor:
-        return 2 * axis[..., :, None] * axis[..., None, :] - torch.eye(3).to(axis)
-
-    return half_turn(functional.normalize(source + target, dim=-1)) @ half_turn(source)
 
 
 def side_alignments(

@@ -2,12 +2,14 @@
 
 import math
 
+import roma
 import torch
 from rigid_motions import DTYPE, random_pose, unit
+from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from articulate_ssl.geometry.screw import axis_angle_to_rotation
-from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
+from articulate_ssl.geometry.se3 import invert_se3, rotation_between, se3, transform_points
 
 
 def test_se3_broadcasts_and_acts_on_column_vectors():
@@ -28,3 +30,12 @@ def test_transform_points_broadcasts_over_parts():
     homogeneous = torch.cat([points, torch.ones_like(points[..., :1])], -1)
     expected = torch.einsum("bkij,blnj->bkni", pose, homogeneous)[..., :3]
     assert_close(transform_points(pose, points), expected)
+
+
+def test_rotation_between_is_the_smallest_one_also_for_equal_directions():
+    source, target = normalize(torch.randn(2, 20, 3, dtype=torch.float64), dim=-1)
+    target[0] = source[0]
+    rotation = rotation_between(source, target)
+    assert_close(torch.einsum("nij,nj->ni", rotation, source), target)
+    angle = roma.rotmat_geodesic_distance(rotation, torch.eye(3, dtype=torch.float64).expand(20, 3, 3))
+    assert_close(angle.cos(), (source * target).sum(-1))
