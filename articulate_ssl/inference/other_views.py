@@ -10,14 +10,16 @@ seen by a camera (`training/closed_door_lesson.py`). Such views are sought, too,
 they were, and are believed where they explain a cloud clearly better (docs/experiments.md, step 279). What no joint
 does gives way to what any view says within the joint's limits, if that fits about as well (step 294).
 
-A closed box still fits as well with another of its sides for the door. What it looks like says more (`box_turns`), if
-that was taught: where a door is as training did not show it, and the box looks clearly righter in another way, it is
-explained in that way (step 289).
+A closed box still fits about as well with another of its sides for the door. So where closed doors were taught, and
+what boxes look like (`box_turns`), a box is explained in every way that is square to its faces and that a camera sees.
+What decides is how far the view is from an explanation, how far the explanation reaches into free space (`free_space`),
+and how right the box looks in that way: none of the three says enough by itself (step 307).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,10 +29,34 @@ from articulate_ssl.inference.box_turns import VIEW_POINTS, BoxTurns
 from articulate_ssl.inference.candidates import ANOTHER_WAY, angle_to
 from articulate_ssl.inference.contest import CLEARLY, Contest
 from articulate_ssl.inference.final_fit import ABOUT_AS_WELL, FinalFit
+from articulate_ssl.inference.free_space import FreeSpace
 from articulate_ssl.inference.upright_camera import UprightCamera
 from articulate_ssl.inference.view_search import Seen, ViewSearch
 from articulate_ssl.inference.votes import Votes
 from articulate_ssl.network.hypotheses import Hypotheses
+
+# How much reaching into free space counts; by what share of its error an explanation may be worse for every unit that
+# its way looks likelier, as a logarithm; so much less likely does a way count at most, or one that is square to no
+# face. From .5 to 1 and from .03 to .05 decide alike (docs/experiments.md, step 307). Chosen there.
+_REACHES, _LOOKS, _UNLIKELY = 0.5, 0.03, 6.0
+
+
+class Sought(NamedTuple):
+    """What is decided for in the end, of B clouds.
+
+    Attributes:
+        one: H = 1, in the clouds' proportions.
+        rival: H = 1, the best that is turned another way.
+        margin: [B] how much worse the rival fits, at most.
+        votes: Which parts points are of.
+        error: [B] by which `one` was decided for.
+    """
+
+    one: Hypotheses
+    rival: Hypotheses
+    margin: Tensor
+    votes: Votes | None
+    error: Tensor
 
 
 class OtherViews:
@@ -51,6 +77,11 @@ class OtherViews:
         """Whether some of the views lie, and it is known which way is up."""
         return bool(self.camera.learnt) and bool(self.final.view_search.quarters.any())
 
+    @property
+    def every_way(self) -> bool:
+        """Whether boxes are explained in every way, as closed doors and looks were taught."""
+        return self.closed.learnt and self.turns.learnt
+
     def measure(self) -> None:
         """Find out at which joint state the door is closed, where views show that (`FinalFit.measure_closed`)."""
         if self.closed.learnt:
@@ -64,12 +95,13 @@ class OtherViews:
         votes: Votes | None,
         points: Tensor,  # [B, N, 3]
         dense: Tensor | None,  # [B, P, 3]
-    ) -> tuple[Hypotheses, Hypotheses, Tensor, Votes | None]:  # H = 1, H = 1, [B]
+    ) -> Sought:
         """Explanations, or what views of each kind say by themselves, where that fits better (`contest`)."""
         final, kinds = self.final, tuple(self._kinds())
+        error = final.distance(one, points)
         if not kinds:
-            return one, rival, margin, votes
-        contest, states = Contest(one, rival, margin, final.distance(one, points)), final.registration.states
+            return Sought(one, rival, margin, votes, error)
+        contest, states = Contest(one, rival, margin, error), final.registration.states
         said = [views.search(points, shown=shown) for views, _, shown in kinds]
         for (views, lying, _), seen, tried in zip(kinds, said, self._fitted(said, points, dense), strict=True):
             error, likely = final.distance(tried, points), states.contains(tried.state[:, 0])
@@ -78,39 +110,55 @@ class OtherViews:
             known, least = states.contains(contest.one.state[:, 0]), CLEARLY if views is self.closed else 1.0
             contest, rows = contest.against(tried, error, likely, torch.where(known, least, ABOUT_AS_WELL))
             votes = votes._replace(share=votes.share.index_copy(0, rows, seen.votes.share[rows]))
-        if self.turns.learnt and dense is not None:
-            contest, votes = self._looking_right(contest, votes, points, dense)
-        return contest.one, contest.rival, contest.margin, votes
+        if self.every_way and dense is not None:
+            contest, votes = self._in_every_way(contest, votes, points, dense)
+        return Sought(contest.one, contest.rival, contest.margin, votes, contest.error)
 
-    def _looking_right(self, contest: Contest, votes: Votes, points: Tensor, dense: Tensor) -> tuple[Contest, Votes]:
-        """What is explained with a door as training did not show it gives way to what looks right, however either fits.
-
-        Of what stands so in all views and in those of closed doors the one that fits better.
-        """
-        final, states = self.final, self.final.registration.states
-        rows = (~states.showed(contest.one.state[:, 0])).nonzero()[:, 0]
-        if not len(rows):
+    def _in_every_way(self, contest: Contest, votes: Votes, points: Tensor, dense: Tensor) -> tuple[Contest, Votes]:
+        """Of all ways that are square to boxes' faces the one that is likeliest by fits, free space and looks."""
+        final, space = self.final, FreeSpace.of(dense)
+        rotation, likely = self._ways(dense)
+        upright = self._upright.stood(contest.one.base[:, 0, :3, :3])[0]
+        contest = contest._replace(error=self._error(contest.one, points, space, _looks_of(upright, rotation, likely)))
+        row, way = likely.isfinite().nonzero().unbind(1)
+        if not len(row):
             return contest, votes
-        frames, angle = manhattan_frames(dense[rows], torch.Generator().manual_seed(0))
-        looks = self.turns.looks(dense[rows, :VIEW_POINTS], frames, seen=self._seen)
-        turn, stood = looks.likeliest, self._upright.stood(contest.one.base[rows, 0, :3, :3])[0]
-        other = looks.decided & (angle < CAP) & (angle_to(stood[:, None], turn)[:, 0] > ANOTHER_WAY)
-        rows, turn, own = rows[other], turn[other], points[rows[other]]
-        if not len(rows):
-            return contest, votes
-        won = torch.zeros_like(contest.margin, dtype=torch.bool)
+        turn, own = rotation[row, way], points[row]
         stand = [(views, (views.quarters == 0).nonzero()[:, 0]) for views in (final.view_search, self.closed)]
         said = [views.search(own, turn, shown) for views, shown in stand if len(shown)]
-        for seen, tried in zip(said, self._fitted(said, own, dense[rows]), strict=True):
-            right = angle_to(tried.base[..., :3, :3], turn)[:, 0] < ANOTHER_WAY
-            likely = torch.zeros_like(won).index_copy(0, rows, right & states.contains(tried.state[:, 0]))
-            error = torch.full_like(contest.error, torch.inf).index_copy(0, rows, final.distance(tried, own))
-            everywhere = contest.one.with_rows(rows, tried)
-            contest, better = contest.against(everywhere, error, likely, torch.where(won, 1.0, torch.inf))
-            won = won.index_fill(0, better, True)
-            share = votes.share.index_copy(0, rows, seen.votes.share)
-            votes = votes._replace(share=votes.share.index_copy(0, better, share[better]))
+        for seen, tried in zip(said, self._fitted(said, own, dense[row]), strict=True):
+            error = torch.full_like(likely, torch.inf)
+            error[row, way] = self._error(tried, own, space.rows(row), likely[row, way])
+            allowed = torch.zeros_like(likely, dtype=torch.bool)
+            turned = angle_to(tried.base[..., :3, :3], turn)[:, 0] < ANOTHER_WAY
+            allowed[row, way] = turned & final.registration.states.contains(tried.state[:, 0])
+            for each in allowed.any(dim=0).nonzero()[:, 0]:
+                of = (way == each).nonzero()[:, 0]
+                everywhere = contest.one.with_rows(row[of], tried.rows(of))
+                contest, rows = contest.against(everywhere, error[:, each], allowed[:, each])
+                share = votes.share.index_copy(0, row[of], seen.votes.share[of])
+                votes = votes._replace(share=votes.share.index_copy(0, rows, share[rows]))
         return contest, votes
+
+    def _error(self, one: Hypotheses, points: Tensor, space: FreeSpace, looks: Tensor) -> Tensor:  # [B]
+        """Distances of views from explanations, and of these from views in free space; more, the less right they look.
+
+        Args:
+            looks: [B] logarithms.
+        """
+        error = self.final.distance(one, points) + _REACHES * space.entered(one.posed()[:, 0].flatten(1, 2))
+        return error * (-_LOOKS * looks).exp()
+
+    def _ways(self, dense: Tensor) -> tuple[Tensor, Tensor]:  # [B, 24, 3, 3], [B, 24]
+        """In which boxes may be turned, and by how much each looks less right than the best; -inf if no camera sees it.
+
+        What is square to nothing may be turned in none.
+        """
+        frames, angle = manhattan_frames(dense, torch.Generator().manual_seed(0))
+        looks = self.turns.looks(dense[:, :VIEW_POINTS], frames, seen=self._seen)
+        seen = (looks.likely > -torch.inf) & (angle < CAP)[:, None]
+        likely = looks.likely - looks.likely.amax(dim=1, keepdim=True)
+        return looks.rotation, likely.clamp(min=-_UNLIKELY).masked_fill(~seen, -torch.inf)
 
     def _seen(self, rotation: Tensor) -> Tensor:
         """Whether a camera sees objects that are turned so, and stand."""
@@ -143,3 +191,15 @@ class OtherViews:
                         yield views, lying, shown
             elif views is self.closed and views.learnt:
                 yield views, None, None
+
+
+def _looks_of(
+    turn: Tensor,  # [B, 3, 3]
+    rotation: Tensor,  # [B, W, 3, 3]
+    likely: Tensor,  # [B, W], -inf: not at all
+) -> Tensor:  # [B]
+    """How right what is turned so looks: as the way that is about so, if there is one."""
+    angle = angle_to(rotation, turn).masked_fill(likely.isinf(), torch.inf)
+    least, way = angle.min(dim=1)
+    found = likely.gather(1, way[:, None])[:, 0]
+    return torch.where(least < ANOTHER_WAY, found, -_UNLIKELY)

@@ -235,9 +235,10 @@ class PoseEstimator(Proposals):
     def _explained(
         self, points: Tensor, num_points: int, refine: bool | None, dense: Tensor | None, fits: bool, rivals: bool
     ) -> tuple[Prediction, Prediction, Tensor]:
-        """See `_predicted`: by the category's own hand; and the errors [B] before proportions.
+        """See `_predicted`: by the category's own hand; and errors [B], by which hands are told apart.
 
-        Proportions make up for the wrong hand.
+        These are the errors before proportions, as proportions make up for the wrong hand; but of doors that may be
+        closed those by which ways are told apart, as the explanation before is one of open doors.
         """
         with torch.autocast(points.device.type, enabled=False):
             registers = (self.inference.refine if refine is None else refine) is not False
@@ -249,7 +250,9 @@ class PoseEstimator(Proposals):
                 before = self.final.distance(chosen, points)
                 chosen, other, margin = self.final.within_limits(chosen, other, margin, points, dense)
                 chosen, other, margin = self.square_search.sought(chosen, other, margin, points, dense)
-                chosen, other, margin, votes = self.other_views.sought(chosen, other, margin, votes, points, dense)
+                sought = self.other_views.sought(chosen, other, margin, votes, points, dense)
+                chosen, other, margin, votes, error = sought
+                before = error if self.other_views.every_way else before
                 if self.view_search.parts is not None and self.object_frame.learnt and dense is not None:
                     turn = (chosen.base[:, 0, :3, :3] @ self.object_frame.axes).mT
                     votes = self.view_search.parts.beside(votes, dense, turn)
@@ -448,7 +451,7 @@ class PoseEstimator(Proposals):
         return self.handedness.likelier((seen, seen), (other, other), self.handedness.log_odds(error, mirrored))[0]
 
     def _searched(self, points: Tensor, dense: Tensor | None) -> tuple[Prediction, Tensor]:
-        """See `search`: by the category's own hand; and the errors [B] before proportions."""
+        """See `search`: by the category's own hand; and errors [B] (see `_explained`)."""
         with torch.autocast(points.device.type, enabled=False):
             if self.view_search.learnt:
                 found, other, margin, votes = self._seen(points, dense)
@@ -470,10 +473,11 @@ class PoseEstimator(Proposals):
         dense: Tensor | None,  # [B, P, 3]
         votes: Votes | None = None,
     ) -> tuple[Prediction, Tensor]:
-        """Explanations in the clouds' proportions, packaged; and their errors [B] before that."""
+        """Explanations in the clouds' proportions, packaged; and errors [B] (see `_explained`)."""
         shown, rival, margin = self.final.within_limits(one, rival, margin, points, dense)
-        shown, _, margin, votes = self.other_views.sought(shown, rival, margin, votes, points, dense)
-        return self._packaged(shown, points, margin, votes, dense), self.final.distance(one, points)
+        shown, _, margin, votes, error = self.other_views.sought(shown, rival, margin, votes, points, dense)
+        error = error if self.other_views.every_way else self.final.distance(one, points)
+        return self._packaged(shown, points, margin, votes, dense), error
 
     def _packaged(
         self,

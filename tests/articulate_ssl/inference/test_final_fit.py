@@ -181,7 +181,7 @@ def test_where_views_show_either_kind_turned_frames_stay(monkeypatch, known):
     estimator.hinge_sides.learnt.fill_(True)
     estimator.hinge_sides.camera.learnt.fill_(True)
     monkeypatch.setattr(type(estimator.other_views), "lie", known)
-    monkeypatch.setattr(estimator.other_views, "sought", lambda *of: of[:4])
+    monkeypatch.setattr(estimator.other_views, "sought", lambda *of: (*of[:4], None))
     asked = []
     monkeypatch.setattr(estimator, "_as_most_are", lambda one, *_: (asked.append(one), one)[1])
     estimator.predict(points, POINTS, dense=points)

@@ -151,6 +151,25 @@ def test_hands_are_told_by_the_errors_before_proportions(monkeypatch):
     assert (shown.reconstruction_error - before).abs().min() > 1e-4  # what is shown has proportions
 
 
+def test_hands_of_boxes_that_may_be_closed_are_told_as_their_ways_are(monkeypatch):
+    """The explanation before would be one of an open door."""
+    module = tiny_module(inference=InferenceOptions(refine=True), orientation_range=60.0).eval()
+    estimator, hands = module.estimator, module.estimator.handedness
+    hands.learnt.fill_(True)
+    hands.slope.fill_(3.0)
+    points = torch.rand(3, POINTS, 3, generator=torch.Generator().manual_seed(6)) - 0.5
+    own, odds = iter(torch.tensor([[0.1, 0.2, 0.3], [0.3, 0.2, 0.1]]).repeat(2, 1)), []
+    monkeypatch.setattr(hands, "likelier", lambda seen, _mirrored, own: odds.append(own) or seen)
+    monkeypatch.setattr(type(estimator.other_views), "every_way", True)
+    monkeypatch.setattr(estimator.other_views, "sought", lambda *of: (*of[:4], next(own)))
+    estimator.predict(points, POINTS, dense=points)
+    estimator.search(points, dense=points)
+    expected = hands.log_odds(torch.tensor([0.1, 0.2, 0.3]), torch.tensor([0.3, 0.2, 0.1]))
+    for some in odds:
+        torch.testing.assert_close(some, expected)
+    assert len(odds) == 2
+
+
 def test_parts_are_drawn_to_a_hinge_that_floats(monkeypatch):
     """As discovery from views leaves it: off both plates; the way registration may move it costs nothing there."""
     data = clouds(LAPTOP, count=4, points=600, resample=True)

@@ -1,5 +1,6 @@
 """Which way round objects are in views is as in the simulated views most like them, whatever a network says."""
 
+import math
 from dataclasses import fields
 
 import pytest
@@ -235,7 +236,7 @@ def test_what_is_hinged_otherwise_is_sought_among_its_own_views_and_believed_whe
     votes = search(points).votes
     votes = votes._replace(share=torch.full_like(votes.share, 0.5))
     sought = estimator.other_views.sought
-    found, rival, margin, said = sought(one, one, torch.full((3,), 2.0), votes, points, data.points)
+    found, rival, margin, said, _ = sought(one, one, torch.full((3,), 2.0), votes, points, data.points)
     if not known:
         assert found is one and said is votes and not shown
         return
@@ -263,7 +264,7 @@ def test_what_is_hinged_otherwise_and_fits_worse_is_a_rival_if_none_is_nearer(le
     one = estimator.articulated.category_at(data.base[:, None], data.state[:, None])
     one = estimator.final.in_proportion(one, points, data.points)
     margin = torch.tensor([1.0, 1.0, 1e-4])
-    found, rival, said, _ = estimator.other_views.sought(one, one, margin, learnt.search(points).votes, points, None)
+    found, rival, said, *_ = estimator.other_views.sought(one, one, margin, learnt.search(points).votes, points, None)
     assert _degrees(found.base[:, 0, :3, :3], data.base[:, :3, :3]).max() < 20
     assert _degrees(rival.base[:2, 0, :3, :3], data.base[:2, :3, :3]).min() > 90
     torch.testing.assert_close(rival.base[2], one.base[2])
@@ -286,7 +287,7 @@ def test_closed_doors_are_sought_among_their_own_views_and_believed_where_they_f
     assert estimator.other_views.sought(*given)[0] is one
     estimator.closed_views.load_state_dict(learnt.state_dict())
     try:
-        found, rival, margin, _ = estimator.other_views.sought(*given)
+        found, rival, margin, *_ = estimator.other_views.sought(*given)
         error, before = (estimator.final.distance(this, points) for this in (found, one))
         assert _degrees(found.base[:, 0, :3, :3], data.base[:, :3, :3]).max() < 20
         assert (error[:2] < CLEARLY * before[:2]).all()
@@ -344,42 +345,70 @@ class _Likes(torch.nn.Module):
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("case", ["clearly", "hardly", "shown", "unseen", "no frame"])
-def test_what_looks_right_another_way_is_explained_so_where_training_showed_no_such_door(
-    learnt, estimator, monkeypatch, case
+@pytest.mark.parametrize(
+    "case, worse, reaches, by, gives_way",
+    [
+        ("looks outweigh a little worse fits", 1.15, 0.0, 8.0, True),
+        ("and no more than that", 1.4, 0.0, 8.0, False),
+        ("which looks a little righter has to fit", 1.15, 0.0, 1.0, False),
+        ("the other reaches into free space", 1.15, 0.4, 0.0, True),
+        ("no camera sees it", 1.0, 0.3, 8.0, False),
+        ("it is square to nothing", 1.0, 0.3, 8.0, False),
+    ],
+)
+def test_boxes_are_explained_in_every_way_and_fits_and_free_space_and_looks_decide(
+    learnt, estimator, monkeypatch, case, worse, reaches, by, gives_way
 ):
-    """Three clouds, of which two are explained the wrong way round, but fit; to a network the truth looks right."""
+    """Three clouds, of which two are explained the wrong way round, which fits; to a network the truth looks right."""
     data = _views(3, seed=8)
     points, truth = data.points[:, :256], data.base[:, :3, :3]
     base = data.base.clone()
     base[:2, :3, :3] = base[:2, :3, :3] @ OVER
     one = estimator.articulated.category_at(base[:, None], data.state[:, None])
-    angle = torch.full((3,), CAP if case == "no frame" else 1.0)
+
+    def right(turn):  # [n, 3, 3], of the clouds that are explained wrongly
+        return _degrees(turn[:, None], truth[None, :2].expand(len(turn), -1, -1, -1)).amin(dim=1) < 20
+
+    def known(turn):  # [3, 24, 3, 3]
+        near = [_degrees(turn, way[:, None].expand_as(turn)) < 5 for way in (truth, base[:, :3, :3])]
+        return near[1] if case == "no camera sees it" else near[0] | near[1]
+
+    angle = torch.full((3,), CAP if case == "it is square to nothing" else 1.0)
     monkeypatch.setattr(other_views, "manhattan_frames", lambda dense, _: (truth.mT, angle))
-    fits = lambda this, points: torch.full((len(points),), 1.0 if this is one else 5.0)  # noqa: E731
+    third = lambda turn: _degrees(turn, truth[2].expand_as(turn)) < 20  # noqa: E731
+    fits = lambda this, _: torch.where(right(turn := this.base[:, 0, :3, :3]), worse, 1.0) - 0.5 * third(turn)  # noqa: E731
     monkeypatch.setattr(estimator.final, "distance", fits)
     monkeypatch.setattr(UprightCamera, "stood", _stands)
-    monkeypatch.setattr(Observation, "allows", lambda _, turn: torch.full(turn.shape[:-2], case != "unseen"))
-    estimator.hinge_sides.camera.learnt.fill_(case != "clearly")  # else views say which way is up
+    monkeypatch.setattr(Observation, "allows", lambda _, turn: known(turn))
+    turned = []
+    posed = other_views.Hypotheses.posed
+    monkeypatch.setattr(
+        other_views.Hypotheses, "posed", lambda this: (turned.append(this.base[:, 0, :3, :3]), posed(this))[1]
+    )
+    free = lambda _, shape: torch.where(right(turned[-1]) | third(turned[-1]), 0.0, reaches)  # noqa: E731
+    monkeypatch.setattr(other_views.FreeSpace, "entered", free)
+    estimator.hinge_sides.camera.learnt.fill_(False)
     estimator.view_search.load_state_dict(learnt.state_dict())
     estimator.closed_views.load_state_dict(learnt.state_dict())
-    estimator.states.seen.copy_(torch.tensor([[-3.0, 3.0] if case == "shown" else [3.0, 4.0]]))
+    estimator.states.seen.copy_(torch.tensor([[-3.0, 3.0]]))
     estimator.states.set_rest(-3.0)
-    estimator.box_turns.surface = likes = _Likes(truth, 1.0 if case == "hardly" else 6.0)
+    estimator.box_turns.surface = likes = _Likes(truth, by)
     votes = learnt.search(points).votes
     votes = votes._replace(share=torch.full_like(votes.share, 0.5))
     given = one, one, torch.full((3,), 2.0), votes, points, data.points
     try:
-        found, rival, margin, said = estimator.other_views.sought(*given)
-        assert torch.equal(found.base[2], one.base[2]) and (said.share[2] == 0.5).all()
-        if case != "clearly":
-            assert torch.equal(found.base, one.base) and (said.share == 0.5).all()
-            return
+        sought = estimator.other_views.sought(*given)
         assert likes.read == [(3, 512, 3)]
-        assert _degrees(found.base[:2, 0, :3, :3], truth[:2]).max() < 20
-        assert torch.equal(rival.base[:2], one.base[:2])
-        torch.testing.assert_close(margin[:2], torch.full((2,), 0.8))
-        assert (said.share[:2] != 0.5).flatten(1).any(dim=1).all()
+        assert torch.equal(sought.one.base[2], one.base[2]) and (sought.votes.share[2] == 0.5).all()
+        if not gives_way:
+            assert torch.equal(sought.one.base, one.base) and (sought.votes.share == 0.5).all()
+            return
+        assert right(sought.one.base[:2, 0, :3, :3]).all()
+        assert torch.equal(sought.rival.base[:2], one.base[:2])
+        before = (1 + other_views._REACHES * reaches) * math.exp(other_views._LOOKS * min(by, other_views._UNLIKELY))
+        torch.testing.assert_close(sought.error[:2], torch.full((2,), worse))
+        torch.testing.assert_close(sought.margin[:2], torch.full((2,), 1 - worse / before), atol=1e-3, rtol=0)
+        assert (sought.votes.share[:2] != 0.5).flatten(1).any(dim=1).all()
     finally:
         estimator.box_turns.surface = None
         estimator.closed_views.forget()
