@@ -48,12 +48,6 @@ class Looks(NamedTuple):
         best = self.likely.topk(2, dim=1).values
         return best[:, 0] - best[:, 1] > DECIDED
 
-    @property
-    def likeliest(self) -> Tensor:
-        """[B, 3, 3] of the rotations."""
-        best = self.likely.argmax(dim=1)
-        return self.rotation[torch.arange(len(best), device=best.device), best]
-
     def of(
         self,
         turn: Tensor,  # [B, C, 3, 3] base rotations
