@@ -366,27 +366,36 @@ def test_boxes_are_explained_in_every_way_and_fits_and_free_space_and_looks_deci
     base[:2, :3, :3] = base[:2, :3, :3] @ OVER
     one = estimator.articulated.category_at(base[:, None], data.state[:, None])
 
-    def right(turn):  # [n, 3, 3], of the clouds that are explained wrongly
+    turned = []  # what was asked for its shape last
+
+    def right(turn):  # of the clouds that are explained wrongly
         return _degrees(turn[:, None], truth[None, :2].expand(len(turn), -1, -1, -1)).amin(dim=1) < 20
 
-    def known(turn):  # [3, 24, 3, 3]
-        near = [_degrees(turn, way[:, None].expand_as(turn)) < 5 for way in (truth, base[:, :3, :3])]
-        return near[1] if case == "no camera sees it" else near[0] | near[1]
+    def third(turn):
+        return _degrees(turn, truth[2].expand_as(turn)) < 20
+
+    def allows(_, turn):  # two ways of each
+        ways = (base[:, :3, :3],) if case == "no camera sees it" else (base[:, :3, :3], truth)
+        return sum(_degrees(turn, way[:, None].expand_as(turn)) < 5 for way in ways) > 0
+
+    def distance(this, _):
+        turn = this.base[:, 0, :3, :3]
+        return torch.where(right(turn), worse, 1.0) - 0.5 * third(turn)
+
+    def posed(this, posed=other_views.Hypotheses.posed):
+        turned.append(this.base[:, 0, :3, :3])
+        return posed(this)
+
+    def entered(*_):
+        return torch.where(right(turned[-1]) | third(turned[-1]), 0.0, reaches)
 
     angle = torch.full((3,), CAP if case == "it is square to nothing" else 1.0)
     monkeypatch.setattr(other_views, "manhattan_frames", lambda dense, _: (truth.mT, angle))
-    third = lambda turn: _degrees(turn, truth[2].expand_as(turn)) < 20  # noqa: E731
-    fits = lambda this, _: torch.where(right(turn := this.base[:, 0, :3, :3]), worse, 1.0) - 0.5 * third(turn)  # noqa: E731
-    monkeypatch.setattr(estimator.final, "distance", fits)
+    monkeypatch.setattr(estimator.final, "distance", distance)
     monkeypatch.setattr(UprightCamera, "stood", _stands)
-    monkeypatch.setattr(Observation, "allows", lambda _, turn: known(turn))
-    turned = []
-    posed = other_views.Hypotheses.posed
-    monkeypatch.setattr(
-        other_views.Hypotheses, "posed", lambda this: (turned.append(this.base[:, 0, :3, :3]), posed(this))[1]
-    )
-    free = lambda _, shape: torch.where(right(turned[-1]) | third(turned[-1]), 0.0, reaches)  # noqa: E731
-    monkeypatch.setattr(other_views.FreeSpace, "entered", free)
+    monkeypatch.setattr(Observation, "allows", allows)
+    monkeypatch.setattr(other_views.Hypotheses, "posed", posed)
+    monkeypatch.setattr(other_views.FreeSpace, "entered", entered)
     estimator.hinge_sides.camera.learnt.fill_(False)
     estimator.view_search.load_state_dict(learnt.state_dict())
     estimator.closed_views.load_state_dict(learnt.state_dict())
