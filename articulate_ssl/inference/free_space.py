@@ -19,9 +19,9 @@ from torch.nn.functional import normalize
 
 from articulate_ssl.ops.chamfer import nearest_distance, nearest_index
 
-FREE_SPACE_POINTS = 2048  # of a view, that are looked at
-# Of an object's bounding radius, how far away the camera is held: about that at which simulated cameras are. Nearer or
-# half as far again decides 1 % of views of safes otherwise.
+_POINTS = 2048  # of a view, that are looked at
+# Of an object's bounding radius, how far away the camera is held: about that at which simulated cameras are. From .7 to
+# 1.5 times as far decide as well, and one view of ninety worse than where the camera was.
 _DISTANCE = 2.3
 # Distances between neighbouring rays beyond which nothing was seen, and, along a ray, before what was seen. From 2 to 5
 # decide alike.
@@ -51,7 +51,7 @@ class FreeSpace(NamedTuple):
         points: Tensor,  # [B, N, 3] farthest-point order
     ) -> FreeSpace:
         """Of views by themselves: the camera is as far away as one that shows the whole object."""
-        points = points[:, :FREE_SPACE_POINTS]
+        points = points[:, :_POINTS]
         low, high = points.amin(dim=1), points.amax(dim=1)
         middle = (low + high) / 2
         radius = (points - middle[:, None]).norm(dim=-1).amax(dim=1)
@@ -70,8 +70,10 @@ class FreeSpace(NamedTuple):
         self,
         shape: Tensor,  # [B, M, 3] of posed surfaces, all around
     ) -> Tensor:  # [B]
-        """How far shapes reach into it: distance from the view of what is in free space, on average of what is not
-        hidden. Has no gradient."""
+        """How far shapes reach into it: distance of what is in free space from the view, on average over what shows.
+
+        Has no gradient.
+        """
         rays, depth = _seen(shape, self.camera)
         nearest = nearest_index(rays, self.rays)
         beside = (rays - self.rays.gather(1, nearest[..., None].expand_as(rays))).norm(dim=-1)

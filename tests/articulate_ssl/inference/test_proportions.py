@@ -137,37 +137,36 @@ def test_what_a_view_hides_pulls_at_nothing():
     assert (back[1] > back[0]).all()  # where they pull, every body becomes shallower
 
 
-def test_hands_are_told_by_the_errors_before_proportions(monkeypatch):
-    module = tiny_module(inference=InferenceOptions(refine=True), orientation_range=60.0).eval()
-    estimator, hands = module.estimator, module.estimator.handedness
+@pytest.fixture
+def two_hands(monkeypatch):
+    """An estimator of a category of two hands, clouds, and the odds that were asked of them, one after another."""
+    estimator = tiny_module(inference=InferenceOptions(refine=True), orientation_range=60.0).eval().estimator
+    hands, odds = estimator.handedness, []
     hands.learnt.fill_(True)
     hands.slope.fill_(3.0)
-    points = torch.rand(3, POINTS, 3, generator=torch.Generator().manual_seed(6)) - 0.5
-    odds = []
     monkeypatch.setattr(hands, "likelier", lambda seen, _mirrored, own: odds.append(own) or seen)
+    return estimator, torch.rand(3, POINTS, 3, generator=torch.Generator().manual_seed(6)) - 0.5, odds
+
+
+def test_hands_are_told_by_the_errors_before_proportions(two_hands):
+    estimator, points, odds = two_hands
     shown, _ = estimator.predict_with_rivals(points, POINTS)
     before, mirrored = estimator.mirror_errors(points, POINTS)
-    torch.testing.assert_close(odds[0], hands.log_odds(before, mirrored))
+    torch.testing.assert_close(odds[0], estimator.handedness.log_odds(before, mirrored))
     assert (shown.reconstruction_error - before).abs().min() > 1e-4  # what is shown has proportions
 
 
-def test_hands_of_boxes_that_may_be_closed_are_told_as_their_ways_are(monkeypatch):
+def test_hands_of_boxes_that_may_be_closed_are_told_as_their_ways_are(two_hands, monkeypatch):
     """The explanation before would be one of an open door."""
-    module = tiny_module(inference=InferenceOptions(refine=True), orientation_range=60.0).eval()
-    estimator, hands = module.estimator, module.estimator.handedness
-    hands.learnt.fill_(True)
-    hands.slope.fill_(3.0)
-    points = torch.rand(3, POINTS, 3, generator=torch.Generator().manual_seed(6)) - 0.5
-    own, odds = iter(torch.tensor([[0.1, 0.2, 0.3], [0.3, 0.2, 0.1]]).repeat(2, 1)), []
-    monkeypatch.setattr(hands, "likelier", lambda seen, _mirrored, own: odds.append(own) or seen)
+    estimator, points, odds = two_hands
+    own, mirrored = torch.tensor([0.1, 0.2, 0.3]), torch.tensor([0.3, 0.2, 0.1])
+    errors = iter([own, mirrored, own, mirrored])
     monkeypatch.setattr(type(estimator.other_views), "every_way", True)
-    monkeypatch.setattr(estimator.other_views, "sought", lambda *of: (*of[:4], next(own)))
+    monkeypatch.setattr(estimator.other_views, "sought", lambda *of: (*of[:4], next(errors)))
     estimator.predict(points, POINTS, dense=points)
     estimator.search(points, dense=points)
-    expected = hands.log_odds(torch.tensor([0.1, 0.2, 0.3]), torch.tensor([0.3, 0.2, 0.1]))
-    for some in odds:
-        torch.testing.assert_close(some, expected)
-    assert len(odds) == 2
+    expected = estimator.handedness.log_odds(own, mirrored)
+    assert len(odds) == 2 and all(torch.equal(some, expected) for some in odds)
 
 
 def test_parts_are_drawn_to_a_hinge_that_floats(monkeypatch):

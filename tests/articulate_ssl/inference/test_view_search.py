@@ -352,6 +352,7 @@ class _Likes(torch.nn.Module):
         ("and no more than that", 1.4, 0.0, 8.0, False),
         ("which looks a little righter has to fit", 1.15, 0.0, 1.0, False),
         ("the other reaches into free space", 1.15, 0.4, 0.0, True),
+        ("what is sought in a way ends in another", 1.15, 0.4, 0.0, False),
         ("no camera sees it", 1.0, 0.3, 8.0, False),
         ("it is square to nothing", 1.0, 0.3, 8.0, False),
     ],
@@ -389,6 +390,8 @@ def test_boxes_are_explained_in_every_way_and_fits_and_free_space_and_looks_deci
     def entered(*_):
         return torch.where(right(turned[-1]) | third(turned[-1]), 0.0, reaches)
 
+    if case == "what is sought in a way ends in another":
+        monkeypatch.setattr(other_views, "ANOTHER_WAY", 0.0)
     angle = torch.full((3,), CAP if case == "it is square to nothing" else 1.0)
     monkeypatch.setattr(other_views, "manhattan_frames", lambda dense, _: (truth.mT, angle))
     monkeypatch.setattr(estimator.final, "distance", distance)
@@ -422,6 +425,14 @@ def test_boxes_are_explained_in_every_way_and_fits_and_free_space_and_looks_deci
         estimator.box_turns.surface = None
         estimator.closed_views.forget()
         estimator.states.forget()
+
+
+def test_what_is_turned_about_as_a_way_that_is_seen_looks_so_and_all_else_as_unlikely_as_any():
+    ways = torch.stack([torch.eye(3), OVER]).expand(4, 2, 3, 3)
+    turn = roma.rotvec_to_rotmat(torch.tensor([[0, 0.1, 0], [0, 3.0, 0], [0, 1.6, 0], [0, 0.1, 0]]))
+    likely = torch.tensor([[-1.0, 0], [-1.0, 0], [-1.0, 0], [-torch.inf, 0]])
+    least = -other_views._UNLIKELY
+    assert other_views._looks_of(turn, ways, likely).tolist() == [-1, 0, least, least]
 
 
 def _stands(_, turn):
