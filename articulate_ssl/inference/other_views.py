@@ -115,12 +115,15 @@ class OtherViews:
         return Sought(contest.one, contest.rival, contest.margin, votes, contest.error)
 
     def _in_every_way(self, contest: Contest, votes: Votes, points: Tensor, dense: Tensor) -> tuple[Contest, Votes]:
-        """Of all ways that are square to boxes' faces the one that is likeliest by fits, free space and looks."""
+        """Of all ways that are square to boxes' faces the one that is likeliest by fits, free space and looks.
+
+        In the way that the best so far is turned no other is sought: views of both kinds had their say there.
+        """
         final, space = self.final, FreeSpace.of(dense)
         rotation, likely = self._ways(dense)
-        upright = self._upright.stood(contest.one.base[:, 0, :3, :3])[0]
-        contest = contest._replace(error=self._error(contest.one, points, space, _looks_of(upright, rotation, likely)))
-        row, way = likely.isfinite().nonzero().unbind(1)
+        away = angle_to(rotation, self._upright.stood(contest.one.base[:, 0, :3, :3])[0])
+        contest = contest._replace(error=self._error(contest.one, points, space, _looks_of(away, likely)))
+        row, way = (likely.isfinite() & (away > ANOTHER_WAY)).nonzero().unbind(1)
         if not len(row):
             return contest, votes
         turn, own = rotation[row, way], points[row]
@@ -194,12 +197,10 @@ class OtherViews:
 
 
 def _looks_of(
-    turn: Tensor,  # [B, 3, 3]
-    rotation: Tensor,  # [B, W, 3, 3]
+    away: Tensor,  # [B, W] radians, of what is explained from every way
     likely: Tensor,  # [B, W], -inf: not at all
 ) -> Tensor:  # [B]
-    """How right what is turned so looks: as the way that is about so, if there is one."""
-    angle = angle_to(rotation, turn).masked_fill(likely.isinf(), torch.inf)
-    least, way = angle.min(dim=1)
+    """How right it looks: as the way that is about so, if there is one."""
+    least, way = away.masked_fill(likely.isinf(), torch.inf).min(dim=1)
     found = likely.gather(1, way[:, None])[:, 0]
     return torch.where(least < ANOTHER_WAY, found, -_UNLIKELY)

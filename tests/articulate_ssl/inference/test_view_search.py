@@ -387,6 +387,13 @@ def test_boxes_are_explained_in_every_way_and_fits_and_free_space_and_looks_deci
         turned.append(this.base[:, 0, :3, :3])
         return posed(this)
 
+    ways = []  # in which views of both kinds were asked
+
+    def search(this, points, turn=None, shown=None, search=type(learnt).search):
+        if turn is not None:
+            ways.append(turn)
+        return search(this, points, turn, shown)
+
     def entered(*_):
         return torch.where(right(turned[-1]) | third(turned[-1]), 0.0, reaches)
 
@@ -399,6 +406,7 @@ def test_boxes_are_explained_in_every_way_and_fits_and_free_space_and_looks_deci
     monkeypatch.setattr(Observation, "allows", allows)
     monkeypatch.setattr(other_views.Hypotheses, "posed", posed)
     monkeypatch.setattr(other_views.FreeSpace, "entered", entered)
+    monkeypatch.setattr(type(learnt), "search", search)
     estimator.hinge_sides.camera.learnt.fill_(False)
     estimator.view_search.load_state_dict(learnt.state_dict())
     estimator.closed_views.load_state_dict(learnt.state_dict())
@@ -415,6 +423,7 @@ def test_boxes_are_explained_in_every_way_and_fits_and_free_space_and_looks_deci
         if not gives_way:
             assert torch.equal(sought.one.base, one.base) and (sought.votes.share == 0.5).all()
             return
+        assert len(ways) == 2 and all(torch.equal(way, truth[:2]) for way in ways), "not in the way that it is turned"
         assert right(sought.one.base[:2, 0, :3, :3]).all()
         assert torch.equal(sought.rival.base[:2], one.base[:2])
         before = (1 + other_views._REACHES * reaches) * math.exp(other_views._LOOKS * min(by, other_views._UNLIKELY))
@@ -432,7 +441,7 @@ def test_what_is_turned_about_as_a_way_that_is_seen_looks_so_and_all_else_as_unl
     turn = roma.rotvec_to_rotmat(torch.tensor([[0, 0.1, 0], [0, 3.0, 0], [0, 1.6, 0], [0, 0.1, 0]]))
     likely = torch.tensor([[-1.0, 0], [-1.0, 0], [-1.0, 0], [-torch.inf, 0]])
     least = -other_views._UNLIKELY
-    assert other_views._looks_of(turn, ways, likely).tolist() == [-1, 0, least, least]
+    assert other_views._looks_of(other_views.angle_to(ways, turn), likely).tolist() == [-1, 0, least, least]
 
 
 def _stands(_, turn):
