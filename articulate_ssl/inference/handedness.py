@@ -52,6 +52,13 @@ class Handedness(LateBuffers):
         self.register_buffer("slope", torch.tensor(0.0))
         self.register_buffer("offset", torch.tensor(0.0))
 
+    def hands(
+        self,
+        clouds: Tensor,  # [B, N, 3]
+    ) -> Tensor:  # [B, N, 3], or [2 B, N, 3] as of `both_hands`
+        """What has to be explained of clouds: in the mirror, too, if the category has two hands."""
+        return both_hands(clouds) if self.learnt else clouds
+
     def log_odds(
         self,
         error: Tensor,  # [B] of predictions
@@ -124,6 +131,13 @@ class Handedness(LateBuffers):
 def in_the_mirror(points: Tensor) -> Tensor:
     """Clouds [..., 3] as an upright camera would see them in a mirror."""
     return points * torch.tensor(_CAMERA_MIRROR).to(points)
+
+
+def both_hands(
+    clouds: Tensor,  # [B, N, 3]
+) -> Tensor:  # [2 B, N, 3]
+    """Clouds, and after them what they are in the mirror: one batch, which for few clouds takes little longer."""
+    return torch.cat([clouds, in_the_mirror(clouds)])
 
 
 def two_kinds(

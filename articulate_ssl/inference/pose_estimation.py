@@ -48,7 +48,7 @@ from articulate_ssl.inference.common_shape import CommonShape
 from articulate_ssl.inference.decision import BothWays, Decision
 from articulate_ssl.inference.final_fit import ABOUT_AS_WELL, FinalFit
 from articulate_ssl.inference.front_ends import FrontEnds
-from articulate_ssl.inference.handedness import Handedness, in_the_mirror
+from articulate_ssl.inference.handedness import Handedness, both_hands
 from articulate_ssl.inference.hinge_sides import HingeSides
 from articulate_ssl.inference.hypothesis_registration import HypothesisRegistration
 from articulate_ssl.inference.object_frame import ObjectFrame
@@ -209,7 +209,10 @@ class PoseEstimator(Proposals):
         self, points: Tensor, num_points: int, refine: bool | None, dense: Tensor | None, fits: bool, rivals: bool
     ) -> tuple[Prediction, Prediction]:
         """See `_predicted`: before a network says poses."""
-        *seen, error = self._explained(points, num_points, refine, dense, fits, rivals)
+        count, hands = len(points), self.handedness.hands
+        shown = None if dense is None else hands(dense)
+        *every, error = self._explained(hands(points), num_points, refine, shown, fits, rivals)
+        seen = [one[:count] for one in every]
         if self.hinge_sides.learnt:
             seen = [self.hinge_sides.counted_from_closed(one) for one in seen]
             seen[0], quarters = self.hinge_sides.decided(seen[0], dense)
@@ -218,9 +221,8 @@ class PoseEstimator(Proposals):
                 seen[0] = self._as_most_are(seen[0], quarters, points, dense)
         if not self.handedness.learnt:
             return tuple(seen)
-        dense = None if dense is None else in_the_mirror(dense)
-        *other, mirrored = self._explained(in_the_mirror(points), num_points, refine, dense, fits, rivals)
-        return self.handedness.likelier(seen, other, self.handedness.log_odds(error, mirrored))
+        mirrored = [one[count:] for one in every]
+        return self.handedness.likelier(seen, mirrored, self.handedness.log_odds(error[:count], error[count:]))
 
     @torch.no_grad()
     def mirror_errors(
@@ -229,8 +231,7 @@ class PoseEstimator(Proposals):
         num_points: int,
     ) -> tuple[Tensor, Tensor]:  # [B], [B]
         """Errors of predictions, and of those of the clouds' mirror images, from which `handedness` learns."""
-        seen = (points, in_the_mirror(points))
-        return tuple(self._explained(some, num_points, None, None, False, False)[2] for some in seen)
+        return self._explained(both_hands(points), num_points, None, None, False, False)[2].chunk(2)
 
     def _explained(
         self, points: Tensor, num_points: int, refine: bool | None, dense: Tensor | None, fits: bool, rivals: bool
@@ -443,12 +444,12 @@ class PoseEstimator(Proposals):
         They are searched from everywhere (`FinalFit.search`). Where parts slide, `sliding_search` takes the place of
         that, if there are dense clouds, and `view_search` where simulated views taught.
         """
-        seen, error = self._searched(points, dense)
+        count, hands = len(points), self.handedness.hands
+        every, error = self._searched(hands(points), None if dense is None else hands(dense))
         if not self.handedness.learnt:
-            return seen
-        dense = None if dense is None else in_the_mirror(dense)
-        other, mirrored = self._searched(in_the_mirror(points), dense)
-        return self.handedness.likelier((seen, seen), (other, other), self.handedness.log_odds(error, mirrored))[0]
+            return every
+        seen, other, odds = every[:count], every[count:], self.handedness.log_odds(error[:count], error[count:])
+        return self.handedness.likelier((seen, seen), (other, other), odds)[0]
 
     def _searched(self, points: Tensor, dense: Tensor | None) -> tuple[Prediction, Tensor]:
         """See `search`: by the category's own hand; and errors [B] (see `_explained`)."""

@@ -141,6 +141,13 @@ def test_two_kinds_are_measured():
         assert float(found) == pytest.approx(true, abs=0.03)
 
 
+def test_both_hands_are_explained_in_one_batch():
+    clouds, handedness = torch.rand(2, 5, 3), Handedness()
+    assert handedness.hands(clouds) is clouds
+    handedness.learnt.fill_(True)
+    torch.testing.assert_close(handedness.hands(clouds), torch.cat([clouds, clouds * torch.tensor([-1.0, 1.0, 1.0])]))
+
+
 def test_few_clouds_say_nothing():
     handedness = Handedness()
     handedness.learn(torch.full((20,), 2.0), torch.ones(20), torch.eye(3))

@@ -389,7 +389,7 @@ def test_boxes_are_explained_in_every_way_and_fits_and_free_space_and_looks_deci
 
     ways = []  # in which views of both kinds were asked
 
-    def search(this, points, turn=None, shown=None, search=type(learnt).search):
+    def search(this, points, turn=None, shown=None, search=ViewSearch.search):
         if turn is not None:
             ways.append(turn)
         return search(this, points, turn, shown)
@@ -406,7 +406,7 @@ def test_boxes_are_explained_in_every_way_and_fits_and_free_space_and_looks_deci
     monkeypatch.setattr(Observation, "allows", allows)
     monkeypatch.setattr(other_views.Hypotheses, "posed", posed)
     monkeypatch.setattr(other_views.FreeSpace, "entered", entered)
-    monkeypatch.setattr(type(learnt), "search", search)
+    monkeypatch.setattr(ViewSearch, "search", search)
     estimator.hinge_sides.camera.learnt.fill_(False)
     estimator.view_search.load_state_dict(learnt.state_dict())
     estimator.closed_views.load_state_dict(learnt.state_dict())
