@@ -111,6 +111,8 @@ def _parser() -> argparse.ArgumentParser:
         study.add_argument("--seed", type=int, default=_ABLATION_SEED, help=f"of the data (default: {_ABLATION_SEED})")
         samples = f"test clouds at most (default: {_ABLATION_SAMPLES})"
         study.add_argument("--samples", type=int, default=_ABLATION_SAMPLES, help=samples)
+        study.add_argument("--source", help="test on a labelled set of this source instead, as `weights test` does")
+        study.add_argument("--root", type=Path, default=Path("data"), help="where that lies (default: data)")
         place = f"for data and results (default: {_ABLATIONS})"
         study.add_argument("--build", type=Path, default=_ABLATIONS, help=place)
     return parser
@@ -220,21 +222,28 @@ def _test(args: argparse.Namespace) -> int:
 def _ablate(args: argparse.Namespace) -> int:
     from articulate_ssl.pretrained import ablation, discovery_ablation
 
-    if args.discovery:
-        return _study(args, discovery_ablation.DiscoveryStudy, discovery_ablation.as_markdown)
-    return _study(args, ablation.Study, ablation.as_markdown)
+    if not args.discovery:
+        return _study(args, ablation.Study, ablation.as_markdown, elsewhere=_elsewhere(args))
+    if args.source:
+        raise CheckpointError("--source: part discovery is tested on clouds of --seed only; leave it out")
+    return _study(args, discovery_ablation.DiscoveryStudy, discovery_ablation.as_markdown)
 
 
 def _columns(args: argparse.Namespace) -> int:
     from articulate_ssl.pretrained.ablation import Study, columns_as_markdown
 
-    return _study(args, Study, columns_as_markdown, "columns")
+    return _study(args, Study, columns_as_markdown, "columns", elsewhere=_elsewhere(args))
 
 
-def _study(args: argparse.Namespace, study: Callable, as_table: Callable, work: str = "run") -> int:
+def _elsewhere(args: argparse.Namespace) -> tuple[str, Path] | None:
+    return (args.source, args.root) if args.source else None
+
+
+def _study(args: argparse.Namespace, study: Callable, as_table: Callable, work: str = "run", **options) -> int:
+    tested_on = f"{args.root}, {args.source}" if args.source else f"data seed {args.seed}"
     for weights in [weights for name in args.names for weights in _named(name)]:
-        found = getattr(study(weights, args.seed, args.samples, args.build), work)(_say)
-        print(f"\n{weights.name}, data seed {args.seed}, {found[0][1]['samples']} clouds\n\n{as_table(found)}")
+        found = getattr(study(weights, args.seed, args.samples, args.build, **options), work)(_say)
+        print(f"\n{weights.name}, {tested_on}, {found[0][1]['samples']} clouds\n\n{as_table(found)}")
     return 0
 
 

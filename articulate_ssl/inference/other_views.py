@@ -67,10 +67,13 @@ class OtherViews:
         camera: Which way is up.
         closed: Views of doors that are nearly closed, if there are any.
         turns: Which way round boxes look right.
+
+    Attributes:
+        reaches: How much reaching into free space counts; 0 leaves it out.
     """
 
     def __init__(self, final: FinalFit, camera: UprightCamera, closed: ViewSearch, turns: BoxTurns) -> None:
-        self.final, self.camera, self.closed, self.turns = final, camera, closed, turns
+        self.final, self.camera, self.closed, self.turns, self.reaches = final, camera, closed, turns, _REACHES
 
     @property
     def lie(self) -> bool:
@@ -149,7 +152,7 @@ class OtherViews:
         Args:
             looks: [B] logarithms.
         """
-        error = self.final.distance(one, points) + _REACHES * space.entered(one.posed()[:, 0].flatten(1, 2))
+        error = self.final.distance(one, points) + self.reaches * space.entered(one.posed()[:, 0].flatten(1, 2))
         return error * (-_LOOKS * looks).exp()
 
     def _ways(self, dense: Tensor) -> tuple[Tensor, Tensor]:  # [B, 24, 3, 3], [B, 24]

@@ -3,7 +3,8 @@
 Nothing is trained anew. Of weights that are loaded again one thing is left out, the rest stays as it was learnt with
 it, and what is predicted is calibrated and tested as ever. So a row says what is lost if one thing goes, not what
 would be learnt without it. Or it is the network that goes, or registration (`training.columns`). Objects are of a data
-seed of their own: those of the card are for the card.
+seed of their own: those of the card are for the card. Or they are of a labelled set that the card knows nothing of, as
+what closed doors taught says nothing about open ones.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any
 
 from articulate_ssl.inference.pose_estimation import PoseEstimator
 from articulate_ssl.pretrained.check import data_of, make_data, tested
+from articulate_ssl.pretrained.elsewhere import labelled_set
 from articulate_ssl.pretrained.markdown_table import cells_of, table_of
 from articulate_ssl.pretrained.study import WeightsStudy
 from articulate_ssl.training.checkpoint import load_module
@@ -82,6 +84,10 @@ def _no_network_of_box_turns(estimator: PoseEstimator) -> None:
     estimator.box_turns.surface = None
 
 
+def _no_free_space(estimator: PoseEstimator) -> None:
+    estimator.other_views.reaches = 0.0
+
+
 def _no_network_of_views_parts(estimator: PoseEstimator) -> None:
     estimator.view_search.parts = None
 
@@ -116,6 +122,7 @@ ABLATIONS = (
     Ablation("the network that says poses", lambda of: of.pose_network.learnt, _no_network_of_poses),
     Ablation("which way round boxes look right", lambda of: of.box_turns.learnt, _no_network_of_box_turns),
     Ablation("views of closed doors", lambda of: of.closed_views.learnt, lambda of: of.closed_views.forget()),
+    Ablation("free space", lambda of: of.other_views.every_way and bool(of.other_views.reaches), _no_free_space),
     Ablation("fronts of drawers", lambda of: of.front_ends.learnt, lambda of: of.front_ends.forget()),
     Ablation(
         "how views are square, and these networks",
@@ -133,14 +140,23 @@ ABLATIONS = (
 )
 
 
+@dataclass(frozen=True)
 class Study(WeightsStudy):
-    """What things are worth that weights have learnt, and the network, and registration."""
+    """What things are worth that weights have learnt, and the network, and registration.
+
+    Attributes:
+        elsewhere: Source and folder of a labelled set to test on (`pretrained.elsewhere`); None is clouds of the seed,
+            as the card's are, which else only calibrate.
+    """
+
+    elsewhere: tuple[str, Path] | None = None
 
     def run(self, say: Callable[[str], None]) -> list[tuple[str, dict[str, Any]]]:
         """What is left out, and the content of `metrics.json` without it.
 
         Raises:
             CheckpointError: if the weights have no card, the seed is the card's own, or no data can be made.
+            ManifestError: if there is no such labelled set, or it is damaged, or has no labels.
         """
         card, place = self._with_data(say)
         estimator = load_module(self.weights.file).estimator
@@ -155,7 +171,7 @@ class Study(WeightsStudy):
         """What predicts, as `lightning test --model.inference.columns true` names it, and its metrics.
 
         Raises:
-            CheckpointError: as `run`.
+            CheckpointError, ManifestError: as `run`.
         """
         card, place = self._with_data(say)
         say(f"{self.weights.name}: no network, network alone, both …")
@@ -172,12 +188,18 @@ class Study(WeightsStudy):
     ) -> dict[str, Any]:
         """The content of `metrics.json` of weights that something was changed of, unless it is known."""
 
-        def measure() -> dict[str, Any]:
-            module = load_module(self.weights.file)
-            change(module)
-            return tested(module, data_of(card, place / "data", module.num_points, self.samples), place)
+        module = load_module(self.weights.file)
+        data, about = data_of(card, place / "data", module.num_points, self.samples), ()
+        if self.elsewhere is not None:
+            source, root = self.elsewhere
+            data, place = labelled_set(source, root, data, self.samples), place / f"on-{source}"
+            about = (str(data.folder.resolve()), data.manifest)
 
-        return self.kept(place / f"{name}.json", measure)
+        def measure() -> dict[str, Any]:
+            change(module)
+            return tested(module, data, place)
+
+        return self.kept(place / f"{name}.json", measure, *about)
 
 
 def _without(ablation: Ablation) -> Callable[[ArticulatedPoseModule], None]:

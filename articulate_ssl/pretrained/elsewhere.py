@@ -49,10 +49,7 @@ def measured_elsewhere(
     module = load_module(weights.file)
     generated = build / f"{weights.name}-seed-{CALIBRATION_SEED}"
     known = data_of(card, generated / "data", module.num_points)
-    options = {name: known.hparams[name] for name in ("view", "num_points", "batch_size")}
-    calibration = {"calibration_set": str(known.folder), "max_test_samples": samples}
-    data = ArticulatedDataModule(card.category, str(root), source, **options, **calibration)
-    _check(data)
+    data = labelled_set(source, root, known, samples)
     if not (known.folder / MANIFEST_NAME).is_file():
         say(f"{weights.name}: generated clouds, for calibration …")
         make_data(card, CALIBRATION_SEED, generated)
@@ -61,8 +58,22 @@ def measured_elsewhere(
     return tested(module, data, place), place
 
 
-def _check(data: ArticulatedDataModule) -> None:
+def labelled_set(
+    source: str, root: Path, known: ArticulatedDataModule, samples: int | None = None
+) -> ArticulatedDataModule:
+    """A set to test on, of which nothing is calibrated; see `measured_elsewhere`.
+
+    Args:
+        known: Generated clouds of the same category and view, which calibrate.
+
+    Raises:
+        ManifestError: if there is no such set, or it is damaged, or has no labels.
+    """
+    options = {name: known.hparams[name] for name in ("category", "view", "num_points", "batch_size")}
+    calibration = {"calibration_set": str(known.folder), "max_test_samples": samples}
+    data = ArticulatedDataModule(root=str(root), source=source, **options, **calibration)
     if not data.manifest.labelled:
         raise ManifestError(f"{data.folder}: has no labels to compare with; `lightning test` says what can be said")
     if not data.manifest.num_samples("test"):
         raise ManifestError(f"{data.folder}: has no test clouds; make it with --train-instances 0 and --test-instances")
+    return data

@@ -7,7 +7,7 @@ import pytest
 from packable import ROOT, made_up_metrics, write_run
 
 from articulate_ssl.cli import main
-from articulate_ssl.pretrained import check, rebuild
+from articulate_ssl.pretrained import ablation, check, rebuild
 from articulate_ssl.training import shipped_weights
 
 
@@ -62,6 +62,25 @@ def test_a_check_says_whether_the_cards_hold(package, monkeypatch, capsys, scale
     monkeypatch.setattr(check, "check", measured)
     assert main(["weights", "check", "--seed", "12"]) == code
     assert words in capsys.readouterr().out
+
+
+def test_studies_are_of_generated_objects_or_of_a_labelled_set(package, monkeypatch, capsys, tmp_path):
+    metrics = made_up_metrics(1.0)
+    asked = []
+
+    def run(study, _):
+        asked.append((study.seed, study.elsewhere))
+        return [("nothing", metrics)]
+
+    monkeypatch.setattr(ablation.Study, "run", run)
+    monkeypatch.setattr(ablation, "as_markdown", lambda found: "a table")
+    assert main(["weights", "ablate", "laptop-complete", "--seed", "3"]) == 0
+    assert "laptop-complete, data seed 3, " in capsys.readouterr().out
+    assert main(["weights", "ablate", "laptop", "--source", "urdf", "--root", str(tmp_path)]) == 0
+    assert f"laptop-complete, {tmp_path}, urdf, " in capsys.readouterr().out
+    assert asked == [(3, None), (57, ("urdf", tmp_path))]
+    assert main(["weights", "ablate", "laptop", "--discovery", "--source", "urdf"]) == 2
+    assert "--source: part discovery is tested on clouds of --seed only" in capsys.readouterr().err
 
 
 def test_a_rebuild_passes_on_what_is_asked_for_and_tells_what_failed(package, monkeypatch, capsys):

@@ -1,6 +1,7 @@
 """What shipped weights are worth without each thing that they have learnt after training."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from articulate_ssl.pretrained import ablation as module
 from articulate_ssl.pretrained.ablation import ABLATIONS, NOTHING, Study, as_markdown, columns_as_markdown
 from articulate_ssl.training.checkpoint import load_module
 from articulate_ssl.training.shipped_weights import ShippedWeights, shipped_weights
+from datamodules.manifest import ManifestError
 
 
 @pytest.fixture
@@ -70,6 +72,22 @@ def test_what_the_network_is_worth_and_registration_is_asked_of_the_same_clouds(
     assert made == [57]
     lines = columns_as_markdown(found).splitlines()
     assert lines[0].endswith("| s / cloud |") and len({line.count("|") for line in lines}) == 1
+
+
+def test_a_labelled_set_may_say_what_things_are_worth(shipped, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "make_data", lambda _, seed, place: write_synthetic_set(place / "data"))
+    root = tmp_path / "elsewhere"
+    write_synthetic_set(root, seed=3, test_instances=2)
+    studies = [Study(shipped, 57, 5, tmp_path / "build", elsewhere) for elsewhere in (("procedural", root), None)]
+    there, here = (study.run(print) for study in studies)
+    assert [name for name, _ in there] == [name for name, _ in here]
+    assert all(metrics["samples"] == 5 for _, metrics in there)
+    assert there[0][1]["r_err_deg"]["mean"] != here[0][1]["r_err_deg"]["mean"]
+    shutil.rmtree(root)
+    write_synthetic_set(root, seed=4, test_instances=2)
+    assert studies[0].run(print)[0][1]["r_err_deg"]["mean"] != there[0][1]["r_err_deg"]["mean"], "another set by now"
+    with pytest.raises(ManifestError, match="no complete data set here"):
+        Study(shipped, 57, 5, tmp_path / "build", ("urdf", root)).run(print)
 
 
 @pytest.mark.parametrize("ablation", ABLATIONS[1:], ids=lambda one: one.name)
