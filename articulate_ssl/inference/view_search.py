@@ -28,7 +28,9 @@ from articulate_ssl.ops.few_bytes import from_few_bytes, in_few_bytes
 _VIEWS, _POINTS = 1000, 256
 _COMPARED = 128  # points of each by which all are compared with a cloud
 _NEAREST = 30  # views that are registered to the cloud
-_ALIKE = 60  # views whose objects are turned about as one's, where that is known. Chosen.
+# Views whose objects are turned about as one's, where that is known, and how many of these are registered: with 30, all
+# of 90 views of safes are explained alike (docs/experiments.md, step 311). Chosen.
+_ALIKE, _NEAREST_ALIKE = 60, 12
 _SCALES, _ROUNDS = (0.08, 0.03), 6  # of that registration
 _VOTING = 5  # of those, with the least errors, that say which parts points are of
 _BUFFERS = ("views", "step", "part", "base", "state", "quarters")
@@ -136,13 +138,14 @@ class ViewSearch(nn.Module):
         views, step, base, state = (value.to(points) for value in (self.views, self.step, self.base, self.state))
         views = from_few_bytes(views, step)
         every = torch.arange(len(views), device=points.device) if shown is None else shown
+        count = _NEAREST if turn is None else _NEAREST_ALIKE
         thin, still = views[:, :_COMPARED].contiguous(), torch.eye(3).to(points)[None]
         found, states, errors, votes = [], [], [], []
         for i, cloud in enumerate(points):
             among = every if turn is None else every[_most_alike(base[every, :3, :3], turn[i])]
             own, copies = thin[among], cloud[:_COMPARED].expand(len(among), -1, -1)
             distance = nearest_distance(copies, own).mean(dim=1) + nearest_distance(own, copies).mean(dim=1)
-            nearest = among[distance.topk(min(_NEAREST, len(among)), largest=False).indices]
+            nearest = among[distance.topk(min(count, len(among)), largest=False).indices]
             pose, error = register_rigid(cloud[:_POINTS], views[nearest], still, 1, _SCALES, _ROUNDS)
             pose, error = pose[:, 0], error[:, 0]
             found.append(invert_se3(pose) @ base[nearest])
