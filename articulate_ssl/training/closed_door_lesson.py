@@ -1,9 +1,10 @@
 """Views of closed doors, of which training showed none: doors are closed in scans, and cameras simulated before them.
 
 No label is read. Discovery has found parts and hinges in scans of open doors, and simulates views of them, in other
-proportions and joint states, which teach the network. Faces say at which state a door is closed, so there are views of
-states from there to where training begins, as well. They are kept apart (`inference.other_views`): a network that is
-taught by closed doors, too, explains open ones worse (docs/experiments.md, step 266).
+proportions and joint states, which teach the network. Faces say at which state a door is closed, or the box about it
+where it has none, as round ones, so there are views of states from there to where training begins, as well. They are
+kept apart (`inference.other_views`): a network that is taught by closed doors, too, explains open ones worse
+(docs/experiments.md, step 266).
 """
 
 from __future__ import annotations
@@ -36,12 +37,12 @@ def learn_closed_doors(
     module: ArticulatedPoseModule,
     data: SetClouds,
 ) -> None:
-    """Keep simulated views of doors between closed and as training shows them, where faces say what closed is."""
+    """Keep simulated views of doors between closed and as training shows them, of what is hinged on a box."""
     estimator, states = module.estimator, module.states
     estimator.closed_views.forget()
     frames, shape = module.part_frames, module.articulated.category.articulated_shape(module.articulated.joint_type)
-    if not frames.flat.all():
-        tell(log, "closed doors: faces do not say at which state they are")
+    if not frames.learnt:
+        tell(log, "closed doors: nothing has faces that say at which state they are")
         return
     closed = closed_state(shape, states.known, frames)
     if states.showed(states.rest.new_tensor([closed]), _SEEN):

@@ -46,9 +46,17 @@ def test_views_show_doors_from_closed_to_where_training_begins(module, monkeypat
 
 def test_an_earlier_runs_views_are_forgotten(module):
     learn_closed_doors(module, None)
-    module.part_frames.flat[1] = False
+    module.part_frames.flat.fill_(False)
     learn_closed_doors(module, None)
     assert not module.estimator.closed_views.learnt and module.asked == 1
+
+
+def test_a_door_without_faces_is_closed_by_the_box_about_it(module):
+    module.part_frames.flat[1] = False
+    module.part_frames.axes[1] = torch.eye(3)
+    learn_closed_doors(module, None)
+    assert module.estimator.closed_views.learnt
+    assert float(module.states.rest) == pytest.approx(ZERO, abs=0.05)
 
 
 @pytest.mark.parametrize("least", [ZERO - 0.1, ZERO + 0.1])
