@@ -160,9 +160,9 @@ def test_hands_of_boxes_that_may_be_closed_are_told_as_their_ways_are(two_hands,
     """The explanation before would be one of an open door."""
     estimator, points, odds = two_hands
     own, mirrored = torch.tensor([0.1, 0.2, 0.3]), torch.tensor([0.3, 0.2, 0.1])
-    errors = iter([own, mirrored, own, mirrored])
+    both = torch.cat([own, mirrored])
     monkeypatch.setattr(type(estimator.other_views), "every_way", True)
-    monkeypatch.setattr(estimator.other_views, "sought", lambda *of: (*of[:4], next(errors)))
+    monkeypatch.setattr(estimator.other_views, "sought", lambda *of: (*of[:4], both))
     estimator.predict(points, POINTS, dense=points)
     estimator.search(points, dense=points)
     expected = estimator.handedness.log_odds(own, mirrored)
