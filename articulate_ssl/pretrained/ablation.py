@@ -23,6 +23,7 @@ from articulate_ssl.training.checkpoint import load_module
 from articulate_ssl.training.columns import SECONDS, TITLES
 from articulate_ssl.training.module import ArticulatedPoseModule
 from articulate_ssl.training.weights_card import WeightsCard
+from datamodules.articulated_data_module import ArticulatedDataModule
 
 NOTHING = "nothing"
 
@@ -180,6 +181,7 @@ class Study(WeightsStudy):
 
     def _with_data(self, say: Callable[[str], None]) -> tuple[WeightsCard, Path]:
         card, place = self.card(), self.build / f"{self.weights.name}-seed-{self.seed}"
+        self._data(card, place)  # a set that is not there is refused before clouds are generated
         self.made(place, lambda: make_data(card, self.seed, place), say)
         return card, place
 
@@ -187,19 +189,21 @@ class Study(WeightsStudy):
         self, name: str, change: Callable[[ArticulatedPoseModule], None], card: WeightsCard, place: Path
     ) -> dict[str, Any]:
         """The content of `metrics.json` of weights that something was changed of, unless it is known."""
-
-        module = load_module(self.weights.file)
-        data, about = data_of(card, place / "data", module.num_points, self.samples), ()
+        data, about = self._data(card, place), ()
         if self.elsewhere is not None:
-            source, root = self.elsewhere
-            data, place = labelled_set(source, root, data, self.samples), place / f"on-{source}"
-            about = (str(data.folder.resolve()), data.manifest)
+            place, about = place / f"on-{self.elsewhere[0]}", (str(data.folder.resolve()), data.manifest)
 
         def measure() -> dict[str, Any]:
+            module = load_module(self.weights.file)
             change(module)
             return tested(module, data, place)
 
         return self.kept(place / f"{name}.json", measure, *about)
+
+    def _data(self, card: WeightsCard, place: Path) -> ArticulatedDataModule:
+        """To test on."""
+        generated = data_of(card, place / "data", load_module(self.weights.file).num_points, self.samples)
+        return generated if self.elsewhere is None else labelled_set(*self.elsewhere, generated, self.samples)
 
 
 def _without(ablation: Ablation) -> Callable[[ArticulatedPoseModule], None]:

@@ -75,8 +75,16 @@ def test_what_the_network_is_worth_and_registration_is_asked_of_the_same_clouds(
 
 
 def test_a_labelled_set_may_say_what_things_are_worth(shipped, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "make_data", lambda _, seed, place: write_synthetic_set(place / "data"))
-    root = tmp_path / "elsewhere"
+    root, made = tmp_path / "elsewhere", []
+
+    def data(_, seed: int, place: Path) -> None:
+        made.append(seed)
+        write_synthetic_set(place / "data")
+
+    monkeypatch.setattr(module, "make_data", data)
+    with pytest.raises(ManifestError, match="no complete data set here"):
+        Study(shipped, 57, 5, tmp_path / "build", ("procedural", root)).run(print)
+    assert not made, "asked for before anything is generated"
     write_synthetic_set(root, seed=3, test_instances=2)
     studies = [Study(shipped, 57, 5, tmp_path / "build", elsewhere) for elsewhere in (("procedural", root), None)]
     there, here = (study.run(print) for study in studies)
@@ -86,8 +94,6 @@ def test_a_labelled_set_may_say_what_things_are_worth(shipped, tmp_path, monkeyp
     shutil.rmtree(root)
     write_synthetic_set(root, seed=4, test_instances=2)
     assert studies[0].run(print)[0][1]["r_err_deg"]["mean"] != there[0][1]["r_err_deg"]["mean"], "another set by now"
-    with pytest.raises(ManifestError, match="no complete data set here"):
-        Study(shipped, 57, 5, tmp_path / "build", ("urdf", root)).run(print)
 
 
 @pytest.mark.parametrize("ablation", ABLATIONS[1:], ids=lambda one: one.name)
