@@ -106,7 +106,7 @@ class _Fits:
         lines: Tensor,  # [P, 3] points of them
         turns: Tensor,  # [T] radians
     ) -> tuple[Tensor, Tensor]:  # [P], [n, P]
-        """How far points are apart, both ways, in the mean of clouds; and each cloud's turn for which they are least."""
+        """How far points are apart, both ways, in the mean of clouds; and at which turn of each cloud least."""
         shown, field = self.points[self.most], self.fields[self.most]
         state, apart = torch.zeros(len(self.points), len(lines)), torch.zeros(len(lines))
         rotation = axis_angle_to_rotation(self.axis.expand(len(turns), 3), turns)
