@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,6 +24,7 @@ from articulate_ssl.discovery.one_object.surface import Surface
 from articulate_ssl.geometry.screw import REVOLUTE, axis_angle_to_rotation
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.shape.joints import Joints
+from articulate_ssl.shape.stretch import principal_directions
 
 # Chosen, not tuned: adjustment makes exact what is found.
 _POINTS = 1024  # of every cloud, among which those that move are looked for
@@ -42,49 +44,53 @@ def has_one_hinge(joints: Joints) -> bool:
 def turned_anew(placed: Placed, surfaces: Sequence[Surface]) -> Placed | None:
     """The same bodies, and the line and the states that explain best what moves.
 
+    Lines are parallel to the axis, or to a principal direction of the body.
+
     Args:
-        placed: Of n clouds, with one hinge, whose body is placed well, and whose axis is about right.
+        placed: Of n clouds, with one hinge, whose bodies are placed well.
         surfaces: n, in their own frames.
 
     Returns:
         That, roughly; None if hardly anything moves.
     """
-    moving = _moving(placed, surfaces)
+    moving, body = _parted(placed, surfaces)
     if min(map(len, moving)) < _FEWEST:
         return None
     middle = torch.cat(moving).mean(dim=0)
-    clouds = [(points - middle).float() for points in moving]
-    pivot, state = _line(clouds, placed.joints.axis[0].float())
-    joints = replace(placed.joints, pivot=pivot.double()[None] + middle)
-    return replace(placed, joints=joints, state=state.double()[:, None])
+    fits = _Fits([(points - middle).float() for points in moving])
+    axes = torch.cat([placed.joints.axis, principal_directions(body).mT]).float()
+    line = fits.finely(min((fits.roughly(axis) for axis in axes), key=lambda line: line.apart))
+    joints = replace(placed.joints, axis=line.axis.double()[None], pivot=line.pivots[:1].double() + middle)
+    return replace(placed, joints=joints, state=line.state.double()[:, None])
 
 
-def _moving(placed: Placed, surfaces: Sequence[Surface]) -> list[Tensor]:
-    """Of each cloud those points [m, 3], in canonical object space, that lie off other clouds' surfaces, moved so."""
+def _parted(placed: Placed, surfaces: Sequence[Surface]) -> tuple[list[Tensor], Tensor]:
+    """Points in canonical object space, by whether they lie off other clouds' surfaces, moved with bodies.
+
+    Returns:
+        Of each cloud those that do [m, 3]; and of all clouds those that do not [m', 3].
+    """
     cost = moving_costs(list(surfaces), placed.base[:, None].numpy(), _POINTS)[..., 0]
-    back = invert_se3(placed.base)
-    return [
-        transform_points(pose, torch.from_numpy(surface.points[: len(far)][far > CAP / 2]))
-        for pose, surface, far in zip(back, surfaces, cost, strict=True)
-    ]
+    points = [torch.from_numpy(surface.points[: len(far)]) for surface, far in zip(surfaces, cost, strict=True)]
+    resting = [transform_points(pose, own) for pose, own in zip(invert_se3(placed.base), points, strict=True)]
+    off = torch.from_numpy(cost > CAP / 2)
+    return [own[moves] for own, moves in zip(resting, off, strict=True)], torch.cat(resting)[~off.flatten()]
 
 
-def _line(
-    clouds: Sequence[Tensor],  # n of [m, 3]: what moves
-    axis: Tensor,  # [3]
-) -> tuple[Tensor, Tensor]:  # [3], [n]
-    """A point of the line about which all of them are the same, turned, and by how much."""
-    across = torch.linalg.svd(axis[None]).Vh[1:]  # [2, 3]
-    low, high = (bound(torch.cat(list(clouds)) @ across.T, dim=0).values for bound in (torch.min, torch.max))
-    ticks = (torch.arange(a - _MARGIN, b + _MARGIN, _STEP) for a, b in zip(low.tolist(), high.tolist(), strict=True))
-    fits = _Fits(clouds, axis)
-    rough = torch.cartesian_prod(*ticks) @ across
-    apart, _ = fits.of(rough, _turns(_TURN))
-    finer = torch.arange(-_AROUND, _AROUND + 1) * (_STEP / _FINER)
-    near = torch.cartesian_prod(finer, finer) @ across
-    lines = (rough[apart.topk(min(_BEST, len(rough)), largest=False).indices][:, None] + near).flatten(0, 1)
-    apart, state = fits.of(lines, _turns(_TURN / 2))
-    return lines[apart.argmin()], state[:, apart.argmin()]
+class _Line(NamedTuple):
+    """A hinge's line.
+
+    Attributes:
+        axis: [3].
+        pivots: [B, 3] points of lines, the best first.
+        apart: How far points are then apart.
+        state: [n] by how much each cloud is turned.
+    """
+
+    axis: Tensor
+    pivots: Tensor
+    apart: float
+    state: Tensor
 
 
 def _turns(step: float) -> Tensor:
@@ -92,32 +98,49 @@ def _turns(step: float) -> Tensor:
 
 
 class _Fits:
-    """How well clouds are the one that shows most, turned about lines of one direction."""
+    """How well clouds [m, 3], about the origin, are the one that shows most, turned about lines."""
 
-    def __init__(self, clouds: Sequence[Tensor], axis: Tensor) -> None:
-        self.axis = axis
+    def __init__(self, clouds: Sequence[Tensor]) -> None:
+        self.reach = torch.cat(list(clouds)).abs().amax(dim=0) + _MARGIN
         self.fields = [DistanceFields.of(cloud[None]) for cloud in clouds]
         some = (np.random.default_rng(0).permutation(len(cloud))[:_COMPARED] for cloud in clouds)
         self.points = [cloud[rows] for cloud, rows in zip(clouds, some, strict=True)]
         self.most = max(range(len(clouds)), key=lambda index: len(clouds[index]))
 
-    def of(
+    def roughly(
         self,
-        lines: Tensor,  # [P, 3] points of them
-        turns: Tensor,  # [T] radians
-    ) -> tuple[Tensor, Tensor]:  # [P], [n, P]
-        """How far points are apart, both ways, in the mean of clouds; and at which turn of each cloud least."""
+        axis: Tensor,  # [3]
+    ) -> _Line:
+        """The best lines of that direction."""
+        across = _across(axis)
+        ticks = [torch.arange(-far, far, _STEP) for far in (across.abs() @ self.reach).tolist()]
+        return self._best(axis, torch.cartesian_prod(*ticks) @ across, _TURN)
+
+    def finely(self, line: _Line) -> _Line:
+        """What is better nearby."""
+        across = _across(line.axis)
+        finer = torch.arange(-_AROUND, _AROUND + 1) * (_STEP / _FINER)
+        near = torch.cartesian_prod(finer, finer) @ across
+        return self._best(line.axis, (line.pivots[:, None] + near).flatten(0, 1), _TURN / 2)
+
+    def _best(self, axis: Tensor, lines: Tensor, step: float) -> _Line:  # lines [P, 3]
+        """Of lines those for which points are least apart, both ways, in the mean of clouds."""
+        turns = _turns(step)
+        rotation = axis_angle_to_rotation(axis.expand(len(turns), 3), turns)
         shown, field = self.points[self.most], self.fields[self.most]
         state, apart = torch.zeros(len(self.points), len(lines)), torch.zeros(len(lines))
-        rotation = axis_angle_to_rotation(self.axis.expand(len(turns), 3), turns)
         for index, (points, own) in enumerate(zip(self.points, self.fields, strict=True)):
-            if index == self.most:
-                continue
-            far = torch.stack([_apart(turn, lines, shown, own, points, field) for turn in rotation])
-            least, best = far.min(dim=0)
-            apart += least / (len(self.points) - 1)
-            state[index] = turns[best]
-        return apart, state
+            if index != self.most:
+                far = torch.stack([_apart(turn, lines, shown, own, points, field) for turn in rotation])
+                least, best = far.min(dim=0)
+                apart += least / (len(self.points) - 1)
+                state[index] = turns[best]
+        order = apart.topk(min(_BEST, len(lines)), largest=False).indices
+        return _Line(axis, lines[order], float(apart[order[0]]), state[:, order[0]])
+
+
+def _across(axis: Tensor) -> Tensor:  # [3] -> [2, 3]
+    return torch.linalg.svd(axis[None]).Vh[1:]
 
 
 def _apart(

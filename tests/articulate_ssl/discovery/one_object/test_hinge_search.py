@@ -7,7 +7,7 @@ import torch
 from articulated_objects import DRAWER, OVEN, clouds
 
 from articulate_ssl.discovery.one_object.adjustment import Placed
-from articulate_ssl.discovery.one_object.find import _by_its_hinge, refined
+from articulate_ssl.discovery.one_object.find import _asked_again, refined
 from articulate_ssl.discovery.one_object.hinge_search import has_one_hinge, turned_anew
 from articulate_ssl.discovery.one_object.surface import Surface
 from articulate_ssl.geometry.kinematic_chain import KinematicChain
@@ -57,7 +57,7 @@ def test_hinge_and_states_are_found_again(world):
 def test_the_object_is_exact_with_it(world):
     truth, surfaces = world
     lost = refined(surfaces, _half_turned(truth), 64)
-    found = _by_its_hinge(lost, surfaces, 64)
+    found = _asked_again(lost, surfaces, 64)
     assert found.misfit.mean() < lost.misfit.mean()
     assert _turned_otherwise(lost.state, truth) > 2 * _turned_otherwise(found.state, truth)
     assert _turned_otherwise(found.state, truth) < 1
@@ -69,9 +69,9 @@ def test_what_fits_better_stays(world, monkeypatch):
     right = refined(surfaces, truth, 64)
     wrong = "articulate_ssl.discovery.one_object.find.turned_anew"
     monkeypatch.setattr(wrong, lambda placed, surfaces: _half_turned(placed))
-    assert _by_its_hinge(right, surfaces, 64) is right
+    assert _asked_again(right, surfaces, 64) is right
     monkeypatch.setattr(wrong, lambda placed, surfaces: None)
-    assert _by_its_hinge(right, surfaces, 64) is right
+    assert _asked_again(right, surfaces, 64) is right
 
 
 def test_what_does_not_move_has_no_hinge(world):
