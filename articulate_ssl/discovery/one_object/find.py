@@ -136,9 +136,13 @@ def _attempt(
 
 def _asked_again(one: OneObject, surfaces: list[Surface], part_points: int) -> OneObject:
     """The object with all bodies placed alike and its hinge where a search leads, if its clouds then fit better."""
-    alike = placed_alike(Placed(replace(one.shape.joints, limits=None), one.base, one.state), one.shape, surfaces)
+    placed = Placed(replace(one.shape.joints, limits=None), one.base, one.state)
+    alike = placed_alike(placed, one.shape, surfaces)
+    anew = turned_anew(alike, surfaces) or alike
+    if anew is placed:
+        return one
     try:
-        other = refined(surfaces, turned_anew(alike, surfaces) or alike, part_points)
+        other = refined(surfaces, anew, part_points)
     except DiscoveryError:
         return one
     return min((one, other), key=lambda found: float(found.misfit.mean()))

@@ -21,15 +21,16 @@ from articulate_ssl.discovery.one_object.moving_labels import CAP
 from articulate_ssl.discovery.one_object.surface import Surface
 from articulate_ssl.discovery.registration import register_rigid
 from articulate_ssl.geometry.rotation_group import rotation_group
-from articulate_ssl.geometry.se3 import invert_se3
+from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.joints import Joints
 
 # All chosen, not tuned.
 _REGISTERED = 256  # points of a part, to find how it may be turned
-_WAYS = 2  # in which a body is taken for itself, turned, and for another part
+_WAYS = 3  # in which a body is taken for itself, turned, and for another part, at most
 _COMPARED = 256  # points of a cloud that are compared with other clouds
 _SAME = 0.3  # radians: what is turned by less is the same way
+_NEAR = 0.1  # normalised units: what a hinge is moved by less is where it was
 _SWEEPS = 5  # through the clouds, at most
 
 
@@ -38,29 +39,48 @@ def placed_alike(
     shape: ArticulatedShape,  # fused from them
     surfaces: Sequence[Surface],  # n
 ) -> Placed:
-    """The same with bodies as most clouds have them; joint states are as they were, for better or worse."""
+    """The same with bodies as most clouds have them; joint states are as they were, for better or worse.
+
+    If all are alike, it is `placed` itself.
+    """
     pose = placed.pose
     base = torch.stack([placed.base] + [pose[:, part] @ turn for part, turn in _ways(shape)])  # [W, n, 4, 4]
     chosen = _most_alike(base.numpy(), surfaces)
-    return replace(placed, base=base[chosen, torch.arange(len(chosen))])
+    return replace(placed, base=base[chosen, torch.arange(len(chosen))]) if chosen.any() else placed
 
 
 def _ways(shape: ArticulatedShape) -> list[tuple[int, Tensor]]:
-    """Which part the root may be taken for, and how it is then turned onto it [4, 4], in canonical object space."""
-    root = shape.joints.chain.root
+    """Which part the root may be taken for, and how it is then turned onto it [4, 4], in canonical object space.
+
+    It may be taken for another part only if the hinge between them stays where it is.
+    """
+    joints = shape.joints
+    root = joints.chain.root
     parts = [shape.points[shape.label == part] for part in range(shape.num_parts)]
     body = parts[root][:_REGISTERED].float()
     rotations = rotation_group(60).elements.to(body)
     found = []
     for part, points in enumerate(parts):
-        turns = register_rigid(body, points[None, :_REGISTERED].float(), rotations, len(rotations))[0][0]
-        ways = []
-        for turn in turns.double():
-            others = ways if part != root else [torch.eye(4).double(), *ways]
-            if len(ways) < _WAYS and all(_angle(turn, other) > _SAME for other in others):
+        turns = register_rigid(body, points[None, :_REGISTERED].float(), rotations, len(rotations))[0][0].double()
+        ways = [torch.eye(4).double()] if part == root else []
+        for turn in turns:
+            own = part == root or _keeps(turn, joints.axis[0], joints.pivot[0])
+            if own and all(_angle(turn, other) > _SAME for other in ways):
                 ways.append(turn)
-        found += [(part, _exactly(turn, parts[root], points)) for turn in ways]
+        ways = ways[1:] if part == root else ways
+        found += [(part, _exactly(turn, parts[root], points)) for turn in ways[:_WAYS]]
     return found
+
+
+def _keeps(
+    turn: Tensor,  # [4, 4]
+    axis: Tensor,  # [3]
+    pivot: Tensor,  # [3]
+) -> bool:
+    """Whether a line stays about where it is."""
+    moved = transform_points(turn, pivot[None])[0] - pivot
+    off = (moved - (moved @ axis) * axis).norm()
+    return bool((turn[:3, :3] @ axis @ axis).abs().clamp(max=1).acos() < _SAME and off < _NEAR)
 
 
 def _angle(one: Tensor, other: Tensor) -> float:
@@ -70,8 +90,9 @@ def _angle(one: Tensor, other: Tensor) -> float:
 def _exactly(turn: Tensor, body: Tensor, part: Tensor) -> Tensor:
     """A turn that brings a body onto a part, adjusted."""
     start = Placed(Joints.none(1, turn), torch.stack([torch.eye(4).to(turn), turn]), turn.new_zeros(2, 0))
-    surfaces = [Surface.of(points.double().numpy()) for points in (body, part)]
-    base = adjusted(start, surfaces, np.zeros((2, len(body)), dtype=int)).base
+    count = min(len(body), len(part))
+    surfaces = [Surface.of(points[:count].double().numpy()) for points in (body, part)]
+    base = adjusted(start, surfaces, np.zeros((2, count), dtype=int)).base
     return base[1] @ invert_se3(base[0])
 
 
