@@ -28,7 +28,7 @@ from articulate_ssl.shape.stretch import principal_directions
 
 # Chosen, not tuned: adjustment makes exact what is found.
 _POINTS = 1024  # of every cloud, among which those that move are looked for
-_COMPARED = 64  # of those
+_COMPARED = 64  # of those; in a first look half of them
 _FEWEST = 8  # of those, in every cloud
 _FAR = 0.1  # normalised units: what is farther is no match
 _MARGIN = 0.1  # normalised units: hinges are that near what moves
@@ -114,24 +114,24 @@ class _Fits:
         """The best lines of that direction."""
         across = _across(axis)
         ticks = [torch.arange(-far, far, _STEP) for far in (across.abs() @ self.reach).tolist()]
-        return self._best(axis, torch.cartesian_prod(*ticks) @ across, _TURN)
+        return self._best(axis, torch.cartesian_prod(*ticks) @ across, _TURN, _COMPARED // 2)
 
     def finely(self, line: _Line) -> _Line:
         """What is better nearby."""
         across = _across(line.axis)
         finer = torch.arange(-_AROUND, _AROUND + 1) * (_STEP / _FINER)
         near = torch.cartesian_prod(finer, finer) @ across
-        return self._best(line.axis, (line.pivots[:, None] + near).flatten(0, 1), _TURN / 2)
+        return self._best(line.axis, (line.pivots[:, None] + near).flatten(0, 1), _TURN / 2, _COMPARED)
 
-    def _best(self, axis: Tensor, lines: Tensor, step: float) -> _Line:  # lines [P, 3]
+    def _best(self, axis: Tensor, lines: Tensor, step: float, count: int) -> _Line:  # lines [P, 3]
         """Of lines those for which points are least apart, both ways, in the mean of clouds."""
         turns = _turns(step)
         rotation = axis_angle_to_rotation(axis.expand(len(turns), 3), turns)
-        shown, field = self.points[self.most], self.fields[self.most]
+        shown, field = self.points[self.most][:count], self.fields[self.most]
         state, apart = torch.zeros(len(self.points), len(lines)), torch.zeros(len(lines))
         for index, (points, own) in enumerate(zip(self.points, self.fields, strict=True)):
             if index != self.most:
-                far = torch.stack([_apart(turn, lines, shown, own, points, field) for turn in rotation])
+                far = torch.stack([_apart(turn, lines, shown, own, points[:count], field) for turn in rotation])
                 least, best = far.min(dim=0)
                 apart += least / (len(self.points) - 1)
                 state[index] = turns[best]
