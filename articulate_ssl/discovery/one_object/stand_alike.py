@@ -27,49 +27,59 @@ from articulate_ssl.shape.joints import Joints
 
 # All chosen, not tuned.
 _REGISTERED = 256  # points of a part, to find how it may be turned
-_WAYS = 3  # in which a body is taken for itself, turned, and for another part, at most
-_COMPARED = 256  # points of a cloud that are compared with other clouds
+_ADJUSTED, _WAYS = 6, 3  # in which a part is turned onto a part, and that are looked at, at most
+_COMPARED = 512  # points of a cloud that are compared with other clouds; where bodies are, half of them say
 _SAME = 0.3  # radians: what is turned by less is the same way
 _NEAR = 0.1  # normalised units: what a hinge is moved by less is where it was
 _SWEEPS = 5  # through the clouds, at most
 
 
 def placed_alike(
-    placed: Placed,  # of n clouds, most of them alike
+    placed: Placed,  # of n clouds, with one hinge, most of them alike
     shape: ArticulatedShape,  # fused from them
     surfaces: Sequence[Surface],  # n
 ) -> Placed:
-    """The same with bodies as most clouds have them; joint states are as they were, for better or worse.
+    """The same with parts and bodies as most clouds have them; joint states are as they were, for better or worse.
 
     If all are alike, it is `placed` itself.
     """
+    return _standing_alike(_named_alike(placed, shape, surfaces), shape, surfaces)
+
+
+def _named_alike(placed: Placed, shape: ArticulatedShape, surfaces: Sequence[Surface]) -> Placed:
+    """With the root where most have it, not where they have the other part; the hinge stays where it is."""
+    root, child, joints = placed.joints.chain.root, placed.joints.chain.child[0], placed.joints
+    ways = [turn for turn in _turns(shape, root, child) if _keeps(turn, joints.axis[0], joints.pivot[0])][:_WAYS]
     pose = placed.pose
-    base = torch.stack([placed.base] + [pose[:, part] @ turn for part, turn in _ways(shape)])  # [W, n, 4, 4]
-    chosen = _most_alike(base.numpy(), surfaces)
+    exchanged = [torch.stack([pose[:, child] @ turn, pose[:, root] @ invert_se3(turn)], dim=1) for turn in ways]
+    chosen = _most_alike(torch.stack([pose[:, [root, child]], *exchanged]), surfaces, _COMPARED)
+    return _with_bases(placed, torch.stack([pose[:, root]] + [own[:, 0] for own in exchanged]), chosen)
+
+
+def _standing_alike(placed: Placed, shape: ArticulatedShape, surfaces: Sequence[Surface]) -> Placed:
+    """With bodies turned as most are, of which nothing else is known then than where the body is."""
+    root = placed.joints.chain.root
+    ways = [turn for turn in _turns(shape, root, root) if _angle(turn, torch.eye(4).to(turn)) > _SAME][:_WAYS]
+    base = torch.stack([placed.base] + [placed.base @ turn for turn in ways])  # [W, n, 4, 4]
+    return _with_bases(placed, base, _most_alike(base[:, :, None], surfaces, _COMPARED // 2))
+
+
+def _with_bases(placed: Placed, base: Tensor, chosen: Tensor) -> Placed:
+    """Placed by the ways [n] that are chosen of bases [W, n, 4, 4]."""
     return replace(placed, base=base[chosen, torch.arange(len(chosen))]) if chosen.any() else placed
 
 
-def _ways(shape: ArticulatedShape) -> list[tuple[int, Tensor]]:
-    """Which part the root may be taken for, and how it is then turned onto it [4, 4], in canonical object space.
-
-    It may be taken for another part only if the hinge between them stays where it is.
-    """
-    joints = shape.joints
-    root = joints.chain.root
-    parts = [shape.points[shape.label == part] for part in range(shape.num_parts)]
-    body = parts[root][:_REGISTERED].float()
-    rotations = rotation_group(60).elements.to(body)
+def _turns(shape: ArticulatedShape, source: int, target: int) -> list[Tensor]:
+    """Ways in which a part is turned [4, 4] to lie on another part, or itself, the best first; adjusted."""
+    source, target = (shape.points[shape.label == part] for part in (source, target))
+    thin = source[:_REGISTERED].float()
+    rotations = rotation_group(60).elements.to(thin)
+    turns = register_rigid(thin, target[None, :_REGISTERED].float(), rotations, len(rotations))[0][0].double()
     found = []
-    for part, points in enumerate(parts):
-        turns = register_rigid(body, points[None, :_REGISTERED].float(), rotations, len(rotations))[0][0].double()
-        ways = [torch.eye(4).double()] if part == root else []
-        for turn in turns:
-            own = part == root or _keeps(turn, joints.axis[0], joints.pivot[0])
-            if own and all(_angle(turn, other) > _SAME for other in ways):
-                ways.append(turn)
-        ways = ways[1:] if part == root else ways
-        found += [(part, _exactly(turn, parts[root], points)) for turn in ways[:_WAYS]]
-    return found
+    for turn in turns:
+        if all(_angle(turn, other) > _SAME for other in found):
+            found.append(turn)
+    return [_exactly(turn, source, target) for turn in found[:_ADJUSTED]]
 
 
 def _keeps(
@@ -96,21 +106,26 @@ def _exactly(turn: Tensor, body: Tensor, part: Tensor) -> Tensor:
     return base[1] @ invert_se3(base[0])
 
 
-def _most_alike(pose: np.ndarray, surfaces: Sequence[Surface]) -> Tensor:  # [W, n, 4, 4] -> [n]
-    """The way of each cloud in which it is nearest to the others, in theirs; at first all are as they were."""
-    ways, count = pose.shape[:2]
+def _most_alike(pose: Tensor, surfaces: Sequence[Surface], count: int) -> Tensor:  # [W, n, K, 4, 4] -> [n]
+    """The way of each cloud in which it is nearest to the others, in theirs; at first all are as they were.
+
+    Of a part's poses; a point moves with the part with which it is nearest.
+    """
+    pose = pose.numpy()
+    ways, clouds, parts = pose.shape[:3]
     back = np.linalg.inv(pose)
-    thin = [surface.thinned(_COMPARED) for surface in surfaces]
+    thin = [surface.thinned(count) for surface in surfaces]
 
     @cache
     def apart(one: int, way: int, other: int, its: int) -> float:
-        return float(surfaces[other].nearest(thin[one].moved(pose[its, other] @ back[way, one]), CAP).mean())
+        moves = [pose[its, other, part] @ back[way, one, part] for part in range(parts)]
+        return float(np.min([surfaces[other].nearest(thin[one].moved(move), CAP) for move in moves], axis=0).mean())
 
-    chosen = [0] * count
+    chosen = [0] * clouds
     for _ in range(_SWEEPS):
         before = chosen.copy()
-        for one in range(count):
-            others = [other for other in range(count) if other != one]
+        for one in range(clouds):
+            others = [other for other in range(clouds) if other != one]
             costs = [sum(apart(one, way, other, chosen[other]) for other in others) for way in range(ways)]
             chosen[one] = int(np.argmin(costs))
         if chosen == before:
