@@ -7,9 +7,10 @@ all clouds that are placed otherwise; and which way most are placed, all pairs o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
+from itertools import permutations
 
 import numpy as np
 import roma
@@ -107,10 +108,7 @@ def _exactly(turn: Tensor, body: Tensor, part: Tensor) -> Tensor:
 
 
 def _most_alike(pose: Tensor, surfaces: Sequence[Surface], count: int) -> Tensor:  # [W, n, K, 4, 4] -> [n]
-    """The way of each cloud in which it is nearest to the others, in theirs; at first all are as they were.
-
-    Of a part's poses; a point moves with the part with which it is nearest.
-    """
+    """The way of each cloud in which it is nearest to the others, in theirs; a point moves with either part."""
     pose = pose.numpy()
     ways, clouds, parts = pose.shape[:3]
     back = np.linalg.inv(pose)
@@ -121,13 +119,35 @@ def _most_alike(pose: Tensor, surfaces: Sequence[Surface], count: int) -> Tensor
         moves = [pose[its, other, part] @ back[way, one, part] for part in range(parts)]
         return float(np.min([surfaces[other].nearest(thin[one].moved(move), CAP) for move in moves], axis=0).mean())
 
-    chosen = [0] * clouds
-    for _ in range(_SWEEPS):
-        before = chosen.copy()
-        for one in range(clouds):
-            others = [other for other in range(clouds) if other != one]
-            costs = [sum(apart(one, way, other, chosen[other]) for other in others) for way in range(ways)]
-            chosen[one] = int(np.argmin(costs))
-        if chosen == before:
-            break
-    return torch.tensor(chosen)
+    return torch.tensor(nearest_ways(apart, ways, clouds))
+
+
+def nearest_ways(apart: Callable[[int, int, int, int], float], ways: int, clouds: int) -> list[int]:
+    """The ways of clouds in which they are least apart from each other, all together, as far as sweeps find them.
+
+    From all as they were; and, as of two kinds that are about as many none would change by itself, from two kinds.
+
+    Args:
+        apart: Of a cloud in a way from another in its way.
+    """
+    pairs = list(permutations(range(clouds), 2))
+
+    def swept(chosen: list[int]) -> tuple[float, list[int]]:
+        for _ in range(_SWEEPS):
+            before = chosen.copy()
+            for one in range(clouds):
+                others = [other for other in range(clouds) if other != one]
+                costs = [sum(apart(one, way, other, chosen[other]) for other in others) for way in range(ways)]
+                chosen[one] = int(np.argmin(costs))
+            if chosen == before:
+                break
+        return sum(apart(one, chosen[one], other, chosen[other]) for one, other in pairs), chosen
+
+    def of_two_kinds(way: int) -> list[int]:
+        nearer = np.zeros((clouds, clouds))
+        for one, other in pairs:
+            nearer[one, other] = apart(one, way, other, 0) - apart(one, 0, other, 0)
+        kind = np.linalg.eigh(nearer + nearer.T)[1][:, -1] > 0
+        return (way * (kind if 2 * kind.sum() <= clouds else ~kind)).tolist()
+
+    return min(map(swept, [[0] * clouds, *map(of_two_kinds, range(1, ways))]))[1]

@@ -9,7 +9,7 @@ from articulated_objects import LAPTOP, OVEN, Clouds, clouds, true_shape
 
 from articulate_ssl.discovery.one_object.adjustment import Placed
 from articulate_ssl.discovery.one_object.find import _asked_again, refined
-from articulate_ssl.discovery.one_object.stand_alike import placed_alike
+from articulate_ssl.discovery.one_object.stand_alike import nearest_ways, placed_alike
 from articulate_ssl.discovery.one_object.surface import Surface
 from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
@@ -103,3 +103,30 @@ def test_the_object_is_exact_again(oven):
     assert found.misfit.mean() < lost.misfit.mean()
     turned = found.state[:, 0] - found.state[0, 0], oven.truth.state[:, 0] - oven.truth.state[0, 0]
     assert min((turned[0] - turned[1]).abs().max(), (turned[0] + turned[1]).abs().max()).rad2deg() < 1
+
+
+def _apart(kind: list[int], off: float = 0.0):
+    """Of clouds of two kinds, which one way brings onto each other, but for what it is off."""
+
+    def apart(one: int, way: int, other: int, its: int) -> float:
+        alike = kind[one] ^ way == kind[other] ^ its
+        return (0.5 if alike else 0.9) + off * (way != its)
+
+    return apart
+
+
+def _kinds(kind: list[int], chosen: list[int]) -> set[int]:
+    return {own ^ way for own, way in zip(kind, chosen, strict=True)}
+
+
+@pytest.mark.parametrize("kind", [[0, 1, 0, 0, 1, 0, 0], [0, 1, 1, 0, 1, 0, 0, 1], [0] * 6])
+@pytest.mark.parametrize("off", [0.0, 0.15])
+def test_clouds_of_two_kinds_become_one(kind, off):
+    """Also where as many are of either, and each is nearer to its own as it is than the way is exact."""
+    chosen = nearest_ways(_apart(kind, off), 2, len(kind))
+    assert len(_kinds(kind, chosen)) == 1
+    assert sum(chosen) <= len(kind) / 2
+
+
+def test_a_way_that_makes_nothing_nearer_is_not_taken():
+    assert nearest_ways(lambda one, way, other, its: 0.5 + 0.1 * (way != 0), 3, 6) == [0] * 6
