@@ -1,8 +1,8 @@
 """Where the hinge of an object is, looked for everywhere, once its body is placed.
 
 Coarse discovery may have a door turn by half of what it does, about a line that is far off: most of its points then
-stay near surfaces that were seen, and rounds of labels and adjustment do not leave that. Of six washing machines, whose
-bodies were placed to a tenth of a degree, it had three so (docs/experiments.md, step 315). But what lies off the
+stay near surfaces that were seen, and rounds of labels and adjustment do not leave that. Of six washing machines it had
+three so, whose bodies were placed to a tenth of a degree (docs/experiments.md, step 315). But what lies off the
 surfaces of other clouds, moved with the body, is what moves; and how it moves about an axis, a point of the hinge says,
 and one state for each cloud.
 """
