@@ -14,9 +14,8 @@ from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.shape.joints import Joints
 
 
-def _joints(data, design, num_parts: int = 2) -> Joints:
-    star = KinematicChain(num_parts, 0, (0,) * (num_parts - 1), tuple(range(1, num_parts)))
-    return Joints(star, data.axis.double(), data.pivot.double(), design[4])
+def _joints(data, design) -> Joints:
+    return Joints(KinematicChain(2, 0, (0,), (1,)), data.axis.double(), data.pivot.double(), design[4])
 
 
 @pytest.fixture(scope="module")
