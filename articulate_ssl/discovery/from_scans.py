@@ -25,6 +25,7 @@ from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.discovery.registered_shape import RegisteredShape
 from articulate_ssl.discovery.simulated_views import simulate_views
 from articulate_ssl.discovery.synchronization import standing_margins, unit_boxes
+from articulate_ssl.discovery.upright_fit import lie
 from articulate_ssl.discovery.view_orientations import find_view_orientations
 from articulate_ssl.geometry.orientation_range import OrientationRange
 from articulate_ssl.geometry.rotation_group import rotation_group
@@ -34,6 +35,8 @@ from articulate_ssl.ops.progress import Stage, announce
 
 _SIDES = 20  # from which every cloud is seen, to find how objects are turned in the views
 _VIEWS = 30  # that are simulated of every scan, each of an object with other proportions and joint states
+
+_UNKNOWN = -1  # quarters
 
 log = logging.getLogger(__name__)
 
@@ -91,14 +94,15 @@ def discover_from_scans(
     Args:
         orientation: How far objects are turned in the views.
         to_stand: Of a shape, the clouds it is registered to (scans, then their mirror images), and which of these [m]
-            fit best: by how many quarters [n] objects are to be turned until they stand as most do, and rotations
-            [n, 3, 3] from canonical space as it then stands to canonical space.
+            fit best: by how many quarters [n] objects are to be turned until they stand as most do, below zero where
+            that is not known, and rotations [n, 3, 3] from canonical space as it then stands to canonical space.
 
     Raises:
         DiscoveryError: if parts are not found (`discover_grouped`).
     """
     found = discover_grouped(clouds, scans, instance, num_parts, joint_type, options)
     best = _likeliest(found, clouds)[: options.kept(len(clouds))]
+    best = best[found.inside[best]]
     random, generator = np.random.default_rng(options.seed), torch.Generator().manual_seed(options.seed)
     mean_distance = float((views - views.mean(dim=1, keepdim=True)).norm(dim=-1).mean())
     quarters, source = torch.zeros(len(clouds), dtype=torch.long), torch.arange(len(clouds))
@@ -107,9 +111,14 @@ def discover_from_scans(
         source = torch.cat([source, torch.full_like(source, -1)])
         found = found.of_clouds(torch.arange(count).repeat(2))
         quarters, lying = to_stand(found, clouds, best)
-        quarters[count:][quarters[:count] == 0] = 0  # what stands is as seen in scans
-    best, lie = best[quarters[best] == 0], quarters.nonzero()[:, 0]
-    kept = torch.cat([best, lie])
+        said = (quarters[:count] > 0).nonzero()[:, 0]
+        believed = lie(found.of_clouds(said), clouds[said, : options.dense_points], lying[said])
+        quarters[said[~believed]] = _UNKNOWN
+        log.info("%d of %d scans that are said to lie fit upright, too", int((~believed).sum()), len(said))
+        stands = quarters[:count] <= 0  # or it is not known: in the mirror it is no better known than in scans
+        quarters[count:][stands] = quarters[:count][stands]
+    best, lies = best[quarters[best] == 0], (quarters > 0).nonzero()[:, 0]
+    kept = torch.cat([best, lies])
     turns = OrientationRange().draw(len(kept) * _VIEWS, generator)
     if orientation.limited:
         _announce(0, "how objects are turned")
@@ -119,7 +128,7 @@ def discover_from_scans(
         found = found.turned(stand.mean)
         turns = stand.draw(len(turns), orientation, generator).unflatten(0, (-1, _VIEWS))
         turns = turns @ (stand.mean @ lying[kept].mT @ stand.mean.mT)[:, None]
-    found, clouds = replace(found.of_clouds(kept), quarters=quarters[kept]), clouds[kept]
+    found, clouds = replace(found.of_clouds(kept), quarters=quarters[kept], sought=None), clouds[kept]
     _announce(1, "views of the scans")
     standing = StandingScans(clouds, source[kept], found, turns.reshape(len(kept), _VIEWS, 3, 3), mean_distance)
     simulated = standing.views(num_points, random)

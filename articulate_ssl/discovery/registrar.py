@@ -66,7 +66,7 @@ class SearchingRegistrar(Registrar):
         base, state = (_chosen(value, best) for value in (fit.base, fit.state))
         fit = InstanceFit(shape, base, state, self.generator)
         fit.optimise(clouds, 2 * few_cycles, shared=False)
-        registered = replace(RegisteredShape.of(fit, clouds), shape=found.shape)
+        registered = replace(RegisteredShape.of(fit, clouds), shape=found.shape, sought=shape.joints.limits)
         return registered.turned_to_mean() if self.observation.orientation.limited else registered
 
 

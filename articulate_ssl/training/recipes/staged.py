@@ -104,8 +104,10 @@ class TrainingRecipe(Recipe):
             found = found.in_the_trees_order()
             if network.shared_axis and network.num_parts > 2:
                 found = with_parallel_axes(found, clouds, self.discovery)
-        # All simulated views are of clouds that fit well.
-        kept = slice(None) if self._simulated else found.error.argsort()[: self.discovery.kept(len(clouds))]
+        kept = slice(None)  # all simulated views are of clouds that fit well
+        if not self._simulated:
+            kept = found.error.argsort()[: self.discovery.kept(len(clouds))]
+            kept = kept[found.inside[kept]]
         registered = found.of_clouds(kept)
         self.found = HandOver(
             clouds[kept, :num_points],

@@ -1,5 +1,7 @@
 """From scans and depth views to views that teach: in the camera's frame, as far turned as the views are."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import roma
@@ -79,8 +81,14 @@ def test_what_lies_is_seen_as_it_stands_and_said_to_lie(monkeypatch):
         quarters[[3, 15]], turn[[3, 15]] = 1, lying  # one that fits well, too
         quarters[[19, 31]], turn[[19, 31]] = 3, lying.mT  # the same in the mirror
         quarters[20] = 2  # in the mirror what stands as it is
+        quarters[[5, 21]], turn[[5, 21]] = 1, lying  # one that fits upright, too
         return quarters, turn
 
+    def lie(found, clouds, turns):
+        assert found.error.tolist() == [3, 5, 15] and len(clouds) == 3 and torch.equal(turns, lying.expand(3, 3, 3))
+        return torch.tensor([True, False, True])
+
+    monkeypatch.setattr(from_scans, "lie", lie)
     monkeypatch.setattr(from_scans, "discover_grouped", lambda *_: truth)
     options, orientation = DiscoveryOptions(grouped=True), OrientationRange(100.0)
     arguments = (views, data.points, data.points, torch.zeros(16, dtype=torch.long), 2, LAPTOP[4], options)
@@ -92,7 +100,7 @@ def test_what_lies_is_seen_as_it_stands_and_said_to_lie(monkeypatch):
     source = of / of[of > 0].min()
     lie = (source - 3).abs().lt(0.1) | (source - 15).abs().lt(0.1)
     assert torch.equal(lie, found.quarters > 0)
-    assert len(points) > 11 * from_scans._VIEWS
+    assert len(points) > 10 * from_scans._VIEWS and ((source - 5).abs() > 0.1).all()
     for quarters, turned in ((0, torch.eye(3)), (1, lying), (3, lying.mT)):
         own = found.base[found.quarters == quarters, :3, :3]
         from_mean, stood_from_mean = (
@@ -102,6 +110,22 @@ def test_what_lies_is_seen_as_it_stands_and_said_to_lie(monkeypatch):
         assert stood_from_mean < 45 and (from_mean > 75) == bool(quarters)
         # Two objects, as they are and in the mirror.
         assert 30 < len(own) <= 2 * from_scans._VIEWS or not quarters
+
+
+def test_clouds_whose_joints_are_at_an_end_of_what_was_sought_teach_nothing(monkeypatch):
+    data = clouds(LAPTOP, count=16, points=1024)
+    ends = torch.tensor([[-2.0, 2.0]])
+    state = data.state.clone()
+    state[[1, 4]] = ends.mT  # fit well
+    found = RegisteredShape(true_shape(LAPTOP, data), data.base, state, torch.zeros(16, 2, 3), torch.arange(16.0))
+    monkeypatch.setattr(from_scans, "discover_grouped", lambda *_: replace(found, sought=ends))
+    views, _ = simulate_views(found, data.points, data.base[:, None, :3, :3], 200, 0.3, np.random.default_rng(5))
+    arguments = (views, data.points, data.points, torch.zeros(16, dtype=torch.long), 2, LAPTOP[4])
+    *_, scans = discover_from_scans(
+        *arguments, DiscoveryOptions(grouped=True), OrientationRange(180.0), POINTS, to_stand=_all_stand
+    )
+    assert scans.source.tolist() == [0, 2, 3, *range(5, 12)]
+    assert scans.found.limits().abs().max() < 1.9
 
 
 def test_in_the_mirror_poses_and_states_are_the_same():

@@ -101,3 +101,21 @@ def test_a_scaled_shape_is_posed_as_much_larger():
     found = _registered(GLASSES)
     base = se3(found.base[:, :3, :3], 2 * found.base[:, :3, 3])
     torch.testing.assert_close(found.shape.scaled(2.0).posed(base, found.state), 2 * _posed(found))
+
+
+def test_states_at_an_end_of_what_was_sought_do_not_say_how_far_joints_go():
+    found = _registered(GLASSES)
+    count = len(found.base)
+    state = torch.linspace(-0.5, 0.5, count)[:, None].repeat(1, 2)
+    state[0, 1], state[3, 0] = 1.99, -1.0
+    found = replace(found, state=state, sought=torch.tensor([[-1.0, 1.0], [-2.0, 2.0]]))
+    inside = torch.ones(count, dtype=torch.bool)
+    inside[[0, 3]] = False
+    assert torch.equal(found.inside, inside)
+    torch.testing.assert_close(found.limits(), replace(found, state=state[inside], sought=None).limits())
+    # What is sought next is as wide as all say.
+    torch.testing.assert_close(found.limited().joints.limits, replace(found, sought=None).limits())
+    assert replace(found, sought=None).inside.all()
+    # Most at an end: what was sought was too narrow.
+    narrow = replace(found, sought=torch.tensor([[-0.1, 0.1], [-2.0, 2.0]]), state=state.clamp(-0.1, 0.1))
+    assert narrow.inside.all()
