@@ -3,7 +3,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup data preview test lint bench bench-gpu compare figures demo weights weights-check clean
+.PHONY: help setup data preview test lint bench bench-gpu compare twins figures demo weights weights-check clean
 
 PYTHON ?= python3
 CLUSTER ?=
@@ -39,9 +39,9 @@ demo_shard = build/demo/data/laptop/$(1)/test/shard-00000.npz
 
 needs := $(packages) $(if $(filter 1,$(CLUSTER)),$(cluster))
 
-ifneq ($(filter data preview compare figures,$(MAKECMDGOALS)),)
+ifneq ($(filter data preview compare twins figures,$(MAKECMDGOALS)),)
 ifndef CAT
-$(error make $(filter data preview compare,$(MAKECMDGOALS)) needs a category, as in: make data CAT=laptop)
+$(error make $(filter data preview compare twins figures,$(MAKECMDGOALS)) needs a category, as in: make data CAT=laptop)
 endif
 endif
 
@@ -82,6 +82,9 @@ bench-gpu: $(needs) ## Measure training and prediction at the paper's size on al
 
 compare: $(needs) ## Train and test every method on the same clouds, can be interrupted: CAT=laptop or all [VIEW SEEDS METHODS="npcs_epn staged" ROOT OUT=build/compare WORKERS=1 ARGS].
 	$(bin)/python -m articulate_ssl.comparison --categories $(CAT) --view '$(VIEW)' --seeds '$(SEEDS)' $(if $(METHODS),--methods $(METHODS)) $(if $(ROOT),--root '$(ROOT)') $(if $(filter command,$(origin OUT)),--build '$(OUT)') $(if $(WORKERS),--workers '$(WORKERS)') $(ARGS)
+
+twins: $(needs) ## Find single objects from scans of each, and score them by labels, can be interrupted: CAT=laptop [SOURCE ROOT OUT=build/twins SEED ARGS].
+	$(bin)/python -m articulate_ssl.comparison.twins --category '$(CAT)' --source '$(SOURCE)' --seed '$(SEED)' $(if $(ROOT),--root '$(ROOT)') $(if $(filter command,$(origin OUT)),--out '$(OUT)') $(ARGS)
 
 figures: $(needs) ## Draw accuracy against noise, and part-level features, into build/figures: CAT=laptop [VIEW=partial ROOT=data ARGS].
 	$(bin)/python -m articulate_ssl.paper_figures --category '$(CAT)' --view '$(if $(filter partial,$(VIEW)),depth,complete)' $(if $(ROOT),--root '$(ROOT)') $(ARGS)
