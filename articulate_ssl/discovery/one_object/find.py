@@ -3,8 +3,8 @@
 1. *Coarse*: part discovery as for a category, with less effort, because all clouds show the same object.
 2. *Fine*, a few rounds: every point goes to the part with which it stays on the surface of all other clouds
    (`moving_labels`), then poses, states and joint lines of all clouds are adjusted together (`adjustment`).
-3. *Once more*, where it has one hinge: with all bodies placed alike (`stand_alike`), and from where else its hinge may
-   be (`hinge_search`); what fits better stays.
+3. *Once more*, with all clouds placed alike (`stand_alike`); where it has one hinge, from where else that may be, too
+   (`hinge_search`). What fits better stays.
 4. *Fuse*: what all clouds show of a part, in canonical object space.
 
 That clouds show the same object is known here: the paper's method, and `discover`, do not use it.
@@ -23,7 +23,7 @@ from articulate_ssl.discovery.discover import DiscoveryError, discover
 from articulate_ssl.discovery.one_object.adjustment import Placed, adjusted
 from articulate_ssl.discovery.one_object.hinge_search import has_one_hinge, turned_anew
 from articulate_ssl.discovery.one_object.moving_labels import CAP, believed, moving_costs, spread_labels
-from articulate_ssl.discovery.one_object.stand_alike import placed_alike
+from articulate_ssl.discovery.one_object.stand_alike import placed_alike, sought_alike
 from articulate_ssl.discovery.one_object.surface import Surface
 from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.geometry.kinematic_chain import KinematicChain
@@ -131,14 +131,17 @@ def _attempt(
     joints = found.shape.joints
     joints = replace(joints, axis=joints.axis.double(), pivot=joints.pivot.double())
     one = refined(surfaces, Placed(joints, found.base.double(), found.state.double()), part_points)
-    return _asked_again(one, surfaces, part_points) if has_one_hinge(joints) else one
+    return _asked_again(one, surfaces, part_points)
 
 
 def _asked_again(one: OneObject, surfaces: list[Surface], part_points: int) -> OneObject:
-    """The object with all bodies placed alike and its hinge where a search leads, if its clouds then fit better."""
+    """The object with all clouds placed alike, a hinge where a search leads, if its clouds then fit better."""
     placed = Placed(replace(one.shape.joints, limits=None), one.base, one.state)
-    alike = placed_alike(placed, one.shape, surfaces)
-    anew = turned_anew(alike, surfaces) or alike
+    if has_one_hinge(placed.joints):
+        alike = placed_alike(placed, one.shape, surfaces)
+        anew = turned_anew(alike, surfaces) or alike
+    else:
+        anew = sought_alike(placed, one.shape, surfaces)
     if anew is placed:
         return one
     try:

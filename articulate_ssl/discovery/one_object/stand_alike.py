@@ -1,8 +1,11 @@
-"""Clouds in which an object was placed back to front, upside down, or with its two parts exchanged.
+"""Clouds in which an object was placed back to front, upside down, or with parts exchanged.
 
 Coarse discovery places each cloud by a few hundred points, for which a box that is turned by half, or a laptop whose
 lid is taken for its base, fits about as well. Of the object's own surface, with normals, what is so placed lies off
 all clouds that are placed otherwise; and which way most are placed, all pairs of clouds say together.
+
+How else clouds may be placed, of objects with one hinge the parts' own shapes say, by which turned parts lie on each
+other. Of those with several joints, turns go with other states of all joints, and the object is sought in every cloud.
 """
 
 from __future__ import annotations
@@ -20,7 +23,10 @@ from torch import Tensor
 from articulate_ssl.discovery.one_object.adjustment import Placed, adjusted
 from articulate_ssl.discovery.one_object.moving_labels import CAP
 from articulate_ssl.discovery.one_object.surface import Surface
+from articulate_ssl.discovery.registered_shape import state_limits
+from articulate_ssl.discovery.registrar import state_starts
 from articulate_ssl.discovery.registration import register_rigid
+from articulate_ssl.discovery.search import search_articulated
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
@@ -28,7 +34,8 @@ from articulate_ssl.shape.joints import Joints
 
 # All chosen, not tuned.
 _REGISTERED = 256  # points of a part, to find how it may be turned
-_ADJUSTED, _WAYS = 6, 3  # in which a part is turned onto a part, and that are looked at, at most
+_WAYS = 3  # in which a part is turned onto a part, that are looked at, at most
+_SOUGHT = 512  # points of every part that are sought in twice as many of a cloud
 _COMPARED = 512  # points of a cloud that are compared with other clouds; where bodies are, half of them say
 _SAME = 0.3  # radians: what is turned by less is the same way
 _NEAR = 0.1  # normalised units: what a hinge is moved by less is where it was
@@ -47,10 +54,34 @@ def placed_alike(
     return _standing_alike(_named_alike(placed, shape, surfaces), shape, surfaces)
 
 
+def sought_alike(
+    placed: Placed,  # of n clouds, most of them alike
+    shape: ArticulatedShape,  # fused from them
+    surfaces: Sequence[Surface],  # n
+) -> Placed:
+    """The same with clouds as the object is found in them, if they are then more alike; whatever joints it has.
+
+    If all stay, it is `placed` itself.
+    """
+    joints, limits = shape.joints, state_limits(placed.state).float()
+    joints = replace(joints, axis=joints.axis.float(), pivot=joints.pivot.float(), limits=limits)
+    thin = shape.thinned(_SOUGHT * shape.num_parts)
+    thin = replace(thin, points=thin.points.float(), joints=joints)
+    clouds = torch.from_numpy(np.stack([surface.points[: 2 * _SOUGHT] for surface in surfaces])).float()
+    rotations, starts = rotation_group(60).elements.to(clouds), state_starts(placed.state.float())
+    found = [value[:, :_WAYS].double() for value in search_articulated(thin, clouds, rotations, starts)[:2]]
+    base, state = (
+        torch.cat([own[:, None], other], dim=1) for own, other in zip((placed.base, placed.state), found, strict=True)
+    )
+    pose = torch.stack([placed.joints.part_pose(*way) for way in zip(base.unbind(1), state.unbind(1), strict=True)])
+    chosen, rows = _most_alike(pose, surfaces, _COMPARED), torch.arange(len(surfaces))
+    return replace(placed, base=base[rows, chosen], state=state[rows, chosen]) if chosen.any() else placed
+
+
 def _named_alike(placed: Placed, shape: ArticulatedShape, surfaces: Sequence[Surface]) -> Placed:
     """With the root where most have it, not where they have the other part; the hinge stays where it is."""
     root, child, joints = placed.joints.chain.root, placed.joints.chain.child[0], placed.joints
-    ways = [turn for turn in _turns(shape, root, child) if _keeps(turn, joints.axis[0], joints.pivot[0])][:_WAYS]
+    ways = _turns(shape, root, child, lambda turn: _keeps(turn, joints.axis[0], joints.pivot[0]))
     pose = placed.pose
     exchanged = [torch.stack([pose[:, child] @ turn, pose[:, root] @ invert_se3(turn)], dim=1) for turn in ways]
     chosen = _most_alike(torch.stack([pose[:, [root, child]], *exchanged]), surfaces, _COMPARED)
@@ -60,7 +91,7 @@ def _named_alike(placed: Placed, shape: ArticulatedShape, surfaces: Sequence[Sur
 def _standing_alike(placed: Placed, shape: ArticulatedShape, surfaces: Sequence[Surface]) -> Placed:
     """With bodies turned as most are, of which nothing else is known then than where the body is."""
     root = placed.joints.chain.root
-    ways = [turn for turn in _turns(shape, root, root) if _angle(turn, torch.eye(4).to(turn)) > _SAME][:_WAYS]
+    ways = _turns(shape, root, root, lambda turn: _angle(turn, torch.eye(4).to(turn)) > _SAME)
     base = torch.stack([placed.base] + [placed.base @ turn for turn in ways])  # [W, n, 4, 4]
     return _with_bases(placed, base, _most_alike(base[:, :, None], surfaces, _COMPARED // 2))
 
@@ -70,17 +101,22 @@ def _with_bases(placed: Placed, base: Tensor, chosen: Tensor) -> Placed:
     return replace(placed, base=base[chosen, torch.arange(len(chosen))]) if chosen.any() else placed
 
 
-def _turns(shape: ArticulatedShape, source: int, target: int) -> list[Tensor]:
-    """Ways in which a part is turned [4, 4] to lie on another part, or itself, the best first; adjusted."""
+def _turns(
+    shape: ArticulatedShape,
+    source: int,
+    target: int,
+    wanted: Callable[[Tensor], bool],
+) -> list[Tensor]:
+    """Ways in which a part is turned [4, 4] to lie on another part, or itself, the best of what is wanted; adjusted."""
     source, target = (shape.points[shape.label == part] for part in (source, target))
     thin = source[:_REGISTERED].float()
     rotations = rotation_group(60).elements.to(thin)
     turns = register_rigid(thin, target[None, :_REGISTERED].float(), rotations, len(rotations))[0][0].double()
     found = []
     for turn in turns:
-        if all(_angle(turn, other) > _SAME for other in found):
+        if wanted(turn) and all(_angle(turn, other) > _SAME for other in found):
             found.append(turn)
-    return [_exactly(turn, source, target) for turn in found[:_ADJUSTED]]
+    return [_exactly(turn, source, target) for turn in found[:_WAYS]]
 
 
 def _keeps(

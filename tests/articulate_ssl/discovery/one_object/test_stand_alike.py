@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 import roma
 import torch
-from articulated_objects import LAPTOP, OVEN, Clouds, clouds, true_shape
+from articulated_objects import GLASSES, LAPTOP, OVEN, Clouds, clouds, true_shape
 
 from articulate_ssl.discovery.one_object.adjustment import Placed
 from articulate_ssl.discovery.one_object.find import _asked_again, refined
-from articulate_ssl.discovery.one_object.stand_alike import nearest_ways, placed_alike
+from articulate_ssl.discovery.one_object.stand_alike import nearest_ways, placed_alike, sought_alike
 from articulate_ssl.discovery.one_object.surface import Surface
 from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
@@ -40,7 +40,9 @@ class _World:
 
     def __init__(self, design, ledge: float):
         data = _with_a_ledge(clouds(design, count=8, points=1792, resample=True, seed=1), ledge)
-        joints = Joints(KinematicChain(2, 0, (0,), (1,)), data.axis.double(), data.pivot.double(), design[4])
+        child = tuple(range(1, len(design[0])))
+        joints = Joints(KinematicChain(len(child) + 1, 0, design[1], child), data.axis, data.pivot, design[4])
+        joints = replace(joints, axis=data.axis.double(), pivot=data.pivot.double())
         self.truth = Placed(joints, data.base.double(), data.state.double())
         self.surfaces = [Surface.of(cloud) for cloud in data.points.double().numpy()]
         self.shape = replace(true_shape(design, data), joints=joints)
@@ -103,6 +105,25 @@ def test_the_object_is_exact_again(oven):
     assert found.misfit.mean() < lost.misfit.mean()
     turned = found.state[:, 0] - found.state[0, 0], oven.truth.state[:, 0] - oven.truth.state[0, 0]
     assert min((turned[0] - turned[1]).abs().max(), (turned[0] + turned[1]).abs().max()).rad2deg() < 1
+
+
+def test_glasses_that_lie_on_their_other_side_in_one_cloud_do_so_no_more():
+    """There the temples are each other's, and so are their states."""
+    world = _World(GLASSES, 0.5)
+    middle = torch.tensor([0.0, 0.0, 0.1]).double()
+    turn = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
+    base, state = world.truth.base.clone(), world.truth.state.clone()
+    base[3], state[3] = base[3] @ se3(turn, middle - turn @ middle), state[3].flip(0)
+    wrong = replace(world.truth, base=base, state=state)
+    lost = refined(world.surfaces, wrong, 512)
+    found = sought_alike(
+        Placed(replace(lost.shape.joints, limits=None), lost.base, lost.state), lost.shape, world.surfaces
+    )
+    assert _turned(lost, world.truth)[3] > 150 and _turned(found, world.truth).max() < 10
+    assert (found.state - world.truth.state).abs().amax(dim=1)[3] < 0.15
+    assert sought_alike(world.truth, world.shape, world.surfaces) is world.truth
+    again = _asked_again(lost, world.surfaces, 512)
+    assert again.misfit.mean() < lost.misfit.mean() and _turned(again, world.truth).max() < 2
 
 
 def _apart(kind: list[int], off: float = 0.0):
