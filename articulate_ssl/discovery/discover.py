@@ -118,8 +118,7 @@ def _rounds(found: RegisteredShape, clouds: Tensor, few: Tensor, registrar: Regi
     options = registrar.options
     for step in range(options.rounds):
         _announce(2 * options.references + 1 + step, options, f"round {step + 1} of {options.rounds}")
-        kept = found.error.argsort()[: options.kept(len(few))]
-        kept = kept[found.inside[kept]]
+        kept = found.best(options.kept(len(few)))
         fit = found.fit(registrar.generator, kept)
         fit.optimise(few[kept], options.cycles, keep=options.keep, owing=True)
         if fit.shape.smallest_share < options.min_share:

@@ -19,8 +19,8 @@ from articulate_ssl.shape.joints import category_chain
 _LIMIT_QUANTILES = (0.05, 0.95)
 _LIMIT_MARGIN = 0.15  # of the width between them, on either side
 # A state is at an end of what was sought if it is nearer to it than this share of the width. Of scans of washing
-# machines and ovens that were explained wrongly most are there, of the others 1 % (docs/experiments.md, step 321); from
-# .01 to .06 it was nearly the same.
+# machines and ovens that were explained wrongly most are there, of the others none (docs/experiments.md, step 321);
+# from .01 to .06 it was nearly the same.
 _AT_END = 0.03
 _MOST_AT_END = 0.5  # of the clouds: were it more, what was sought would be too narrow. Chosen.
 _OF_CLOUDS = ("base", "state", "log_stretch", "error", "beside", "point_part", "quarters")
@@ -90,6 +90,11 @@ class RegisteredShape:
         end = _AT_END * (high - low)
         inside = ((self.state > low + end) & (self.state < high - end)).all(dim=1)
         return inside if (~inside).double().mean() <= _MOST_AT_END else everywhere
+
+    def best(self, count: int) -> Tensor:
+        """Of so many clouds that fit best, those that are `inside`, the best first."""
+        best = self.error.argsort()[:count]
+        return best[self.inside[best]]
 
     def limits(self) -> Tensor:
         """[J, 2] between which joint states lie, as far as clouds show that are not at an end of what was sought."""

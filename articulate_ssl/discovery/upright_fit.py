@@ -16,9 +16,9 @@ from articulate_ssl.discovery.instance_fit import InstanceFit
 from articulate_ssl.discovery.registered_shape import RegisteredShape
 from articulate_ssl.geometry.se3 import se3
 
-# By how much worse, as a share, the upright explanation has to be. Of clouds of ovens that lie ten fit .12 to .45 worse
-# upright, one .02; of ovens and washing machines that stand and were said to lie all fit better (docs/experiments.md,
-# step 321).
+# By how much worse, as a share, the upright explanation has to be. Of twelve clouds of ovens that lie ten fit .12 to
+# .45 worse upright, one .02, and one better; of three of ovens and washing machines that stand and were said to lie all
+# fit better (docs/experiments.md, step 321).
 _WORSE = 0.05
 _STATES = 3  # of every joint, evenly within its limits, from which a descent starts
 _CYCLES = (4, 8)  # of descent from all of these, and from the best, as after a search

@@ -104,10 +104,8 @@ class TrainingRecipe(Recipe):
             found = found.in_the_trees_order()
             if network.shared_axis and network.num_parts > 2:
                 found = with_parallel_axes(found, clouds, self.discovery)
-        kept = slice(None)  # all simulated views are of clouds that fit well
-        if not self._simulated:
-            kept = found.error.argsort()[: self.discovery.kept(len(clouds))]
-            kept = kept[found.inside[kept]]
+        # All simulated views are of clouds that fit well.
+        kept = slice(None) if self._simulated else found.best(self.discovery.kept(len(clouds)))
         registered = found.of_clouds(kept)
         self.found = HandOver(
             clouds[kept, :num_points],

@@ -112,6 +112,7 @@ def test_states_at_an_end_of_what_was_sought_do_not_say_how_far_joints_go():
     inside = torch.ones(count, dtype=torch.bool)
     inside[[0, 3]] = False
     assert torch.equal(found.inside, inside)
+    assert replace(found, error=torch.arange(float(count)).flip(0)).best(4).tolist() == [5, 4, 2]
     torch.testing.assert_close(found.limits(), replace(found, state=state[inside], sought=None).limits())
     # What is sought next is as wide as all say.
     torch.testing.assert_close(found.limited().joints.limits, replace(found, sought=None).limits())
