@@ -1,19 +1,22 @@
 """Parts and joints of a category are found from its clouds alone."""
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from itertools import permutations
 
 import pytest
 import roma
 import torch
-from articulated_objects import DRAWER, GLASSES, LAPTOP, clouds
+from articulated_objects import DRAWER, GLASSES, LAPTOP, clouds, true_shape
 from twin_objects import with_coarse_slides
 
-from articulate_ssl.discovery.discover import DiscoveryError, discover
+from articulate_ssl.discovery.discover import DiscoveryError, _rounds, discover
+from articulate_ssl.discovery.instance_fit import InstanceFit
 from articulate_ssl.discovery.options import DiscoveryOptions
 from articulate_ssl.discovery.proposals import load_proposals
 from articulate_ssl.discovery.proposals.random_cuts import random_split
+from articulate_ssl.discovery.registered_shape import RegisteredShape
+from articulate_ssl.discovery.registrar import Registrar
 from articulate_ssl.discovery.registration import chamfer_l1
 from articulate_ssl.shape.stretch import hinged, principal_directions, stretch_matrices
 
@@ -90,6 +93,31 @@ def test_the_same_clouds_give_the_same_parts_whatever_the_random_state():
     torch.manual_seed(2)
     second = discover(data.points, 2, LAPTOP[4], small)
     assert torch.equal(first.base, second.base) and torch.equal(first.shape.label, second.shape.label)
+
+
+@dataclass(frozen=True)
+class _Onlooker(Registrar):
+    """Says of how many clouds what it is given is, and registers nothing."""
+
+    given: list[int] = field(default_factory=list)
+
+    def register(self, found, clouds):
+        self.given.append(len(found.state))
+        return found
+
+
+def test_clouds_whose_joints_are_where_the_search_ended_do_not_count_in_a_round():
+    data = clouds(LAPTOP, count=6)
+    fit = InstanceFit(true_shape(LAPTOP, data), data.base, data.state, torch.Generator().manual_seed(0))
+    low, high = data.state.min(), data.state.max()
+    few = DiscoveryOptions(rounds=1, cycles=1, keep=1.0)
+    found = RegisteredShape.of(fit, data.points)
+    given = []
+    for sought in ([low - 1, high + 1], [low, high + 1], [low, high]):
+        onlooker = _Onlooker(few, torch.Generator().manual_seed(0))
+        _rounds(replace(found, sought=torch.tensor([sought])), data.points, data.points, onlooker)
+        given += onlooker.given
+    assert given == [6, 5, 4]
 
 
 def test_three_parts_make_a_tree_of_two_joints():
