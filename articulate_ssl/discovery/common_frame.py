@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from articulate_ssl.discovery.manhattan_frame import manhattan_frames
+from articulate_ssl.discovery.sharp_profiles import sharpened
 from articulate_ssl.discovery.synchronization import pairwise_costs, synchronise, unit_boxes
 from articulate_ssl.geometry.rotation_group import rotation_group
 
@@ -28,6 +29,7 @@ def common_frame(
     log.info("Manhattan frames: normals %.1f degrees from their axes in the median", angle.median())
     if angle.median() > _LARGEST_ANGLE:
         return None
+    rotation = sharpened(clouds, rotation, generator)
     group = rotation_group(24)
     boxes, _, _ = unit_boxes(clouds @ rotation.mT)
     element = synchronise(pairwise_costs(boxes, group), group, generator)

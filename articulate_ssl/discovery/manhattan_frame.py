@@ -35,20 +35,21 @@ def surface_normals(
 def _normals(
     cloud: Tensor,  # [N, 3]
 ) -> tuple[Tensor, Tensor]:  # [m, 3], [m] bool
-    """As `surface_normals`, in the first window that sees planes, else in the first of all."""
-    first, at = None, torch.arange(0, len(cloud), _STRIDE, device=cloud.device)[None]
+    """As `surface_normals`, in the first window that sees planes enough, else in the one that sees most."""
+    most, found, at = -1.0, None, torch.arange(0, len(cloud), _STRIDE, device=cloud.device)[None]
     for neighbours, flatness in _WINDOWS:
-        if first is not None and neighbours > _SMALL * len(cloud):
+        if found is not None and neighbours > _SMALL * len(cloud):
             break
         patch = nearest_neighbors(cloud[None], neighbours, at).offset[0].permute(1, 2, 0)  # [m, k, 3]
         offset = patch - patch.mean(dim=1, keepdim=True)
         variance, directions = torch.linalg.eigh(offset.mT @ offset)
         planar = variance[:, 0] < flatness**2 * variance[:, 1]
-        found = directions[..., 0], planar
-        if planar.to(cloud).mean() >= _ENOUGH:
-            return found
-        first = found if first is None else first
-    return first
+        share = float(planar.to(cloud).mean())
+        if share > most:
+            most, found = share, (directions[..., 0], planar)
+        if share >= _ENOUGH:
+            break
+    return found
 
 
 def manhattan_frames(

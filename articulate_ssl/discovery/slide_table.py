@@ -22,7 +22,9 @@ from articulate_ssl.shape.articulated_shape import ArticulatedShape
 _ACROSS = 0.7  # width across
 _BACK = -0.66  # where backs stand
 _OFFSETS = 0.015 * torch.arange(-32, 33)  # up to two thirds of the width across either way, a cell of the field apart
-_DEPTHS = torch.tensor([0.7, 0.76, 0.82, 0.88, 0.94, 1.0, 1.06, 1.13, 1.2, 1.28, 1.36])  # over the template's
+DEPTHS = torch.tensor([0.7, 0.76, 0.82, 0.88, 0.94, 1.0, 1.06, 1.13, 1.2, 1.28, 1.36])  # over the template's
+# Of clouds of one object: their depth, and the largest extent of any, in the unit in which the fields hold all.
+SAME_DEPTH, SAME_EXTENT = torch.ones(1), 1.3
 _CAP = 0.06  # distances beyond count as this
 _NEIGHBOURS = 12  # points over which costs are averaged
 _DEPTH_ROUNDS, _PROFILE_ROUNDS = 3, 6
@@ -66,14 +68,18 @@ class Standing(NamedTuple):
     def of(
         clouds: Tensor,  # [n, N, 3] in a common frame
         direction: Direction,
+        unit: float | None = None,
     ) -> Standing:
-        """Stand clouds with their backs on one plane."""
+        """Stand clouds with their backs on one plane; with a unit, without stretching them to one width."""
         axis, sign = direction
         _, center, width = unit_boxes(clouds)
         back = center[:, axis] - sign * width[:, axis] / 2
-        across = [other for other in range(3) if other != axis]
-        width[:, axis] = width[:, across].prod(dim=1).sqrt()
-        width = width / _ACROSS
+        if unit is None:
+            across = [other for other in range(3) if other != axis]
+            width[:, axis] = width[:, across].prod(dim=1).sqrt()
+            width = width / _ACROSS
+        else:
+            width = torch.full_like(width, unit)
         center[:, axis] = back - sign * _BACK * width[:, axis]
         return Standing((clouds - center[:, None]) / width[:, None], center, width)
 
@@ -83,11 +89,12 @@ def offset_costs(
     fields: DistanceFields,
     cloud: int,
     direction: Direction,
+    depths: Tensor = DEPTHS,
 ) -> Tensor:  # [T, depths, offsets]
     """Distance of every point and its neighbours to one cloud, at every depth and offset."""
     near = torch.cdist(template, template).topk(min(_NEIGHBOURS, len(template)), largest=False).indices
     along = direction.sign * template[:, direction.axis]
-    height = (along - _BACK) * _DEPTHS[:, None, None] + _BACK + _OFFSETS[:, None]  # [depths, offsets, T]
+    height = (along - _BACK) * depths[:, None, None] + _BACK + _OFFSETS[:, None]  # [depths, offsets, T]
     slid = template.expand(*height.shape, 3).clone()
     slid[..., direction.axis] = direction.sign * height
     return fields.at(cloud, slid).clamp(max=_CAP)[..., near].mean(dim=-1).permute(2, 0, 1)
@@ -113,13 +120,14 @@ def cluster_slides(
     min_share: float,
     restarts: int,
     generator: torch.Generator,
+    depths: Tensor = DEPTHS,
 ) -> Slides | None:
     """Pieces whose points slide alike in all clouds, whatever they surround; None if none has points enough.
 
     K profiles (an offset per cloud) start at random points; each point goes to the cheapest profile, each profile to
     the best offsets of its points. Between rounds of restarts every cloud's depth is read anew.
     """
-    depth = torch.full(table.shape[1:2], int((_DEPTHS == 1).nonzero()))
+    depth = torch.full(table.shape[1:2], int((depths == 1).nonzero()))
     best = None
     for _ in range(_DEPTH_ROUNDS):
         flat = table[:, torch.arange(table.shape[1]), depth]  # [T, n, offsets]
@@ -165,14 +173,16 @@ def place(
     clouds: Tensor,  # [n, N, 3] in the shape's canonical frame, but for translation, depth and width
     num_points: int,
     fields: DistanceFields | None = None,  # of the clouds standing for the direction of the slide, if known
+    depths: Tensor = DEPTHS,
+    unit: float | None = None,  # as in `Standing.of`
 ) -> Placement:
     """Read off where a shape's parts are: each where it fits best, and with one of them where it fits second best."""
     direction, chain = Direction.of(shape.joints.axis[0]), shape.joints.chain
-    own, standing = Standing.of(shape.points[None], direction), Standing.of(clouds, direction)
+    own, standing = Standing.of(shape.points[None], direction, unit), Standing.of(clouds, direction, unit)
     fields = DistanceFields.of(standing.points) if fields is None else fields
-    depth, offset = _best_offsets(shape, own.points[0], fields, direction, num_points)  # [n], [n, C, K]
-    unit = standing.width[:, direction.axis]
-    state = (offset[..., list(chain.child)] - offset[..., [chain.root]]) * unit[:, None, None]
+    depth, offset = _best_offsets(shape, own.points[0], fields, direction, num_points, depths)  # [n], [n, C, K]
+    along = standing.width[:, direction.axis]
+    state = (offset[..., list(chain.child)] - offset[..., [chain.root]]) * along[:, None, None]
     ratio = standing.width / own.width
     ratio[:, direction.axis] *= depth
     # Where the middle of the root, about which it stretches, comes to lie.
@@ -180,27 +190,32 @@ def place(
     inside = (middle - own.center[0]) / own.width[0]
     target = (standing.center + inside * standing.width)[:, None].expand(*offset.shape[:2], 3).clone()
     height = (direction.sign * inside[direction.axis] - _BACK) * depth[:, None] + _BACK + offset[..., chain.root]
-    target[..., direction.axis] = standing.center[:, None, direction.axis] + direction.sign * height * unit[:, None]
+    target[..., direction.axis] = standing.center[:, None, direction.axis] + direction.sign * height * along[:, None]
     base = se3(torch.eye(3).to(clouds).expand(*offset.shape[:2], 3, 3), target - middle)
     log_stretch = ratio.log()[:, None, None].expand(*offset.shape, 3)
     return Placement(base, state, log_stretch)
 
 
 def _best_offsets(
-    shape: ArticulatedShape, template: Tensor, fields: DistanceFields, direction: Direction, num_points: int
+    shape: ArticulatedShape,
+    template: Tensor,
+    fields: DistanceFields,
+    direction: Direction,
+    num_points: int,
+    depths: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Depth [n] and offsets [n, 1 + K, K]: the best of all parts, and the best of all but one."""
     thin = torch.linspace(0, len(template) - 1, min(len(template), num_points)).round().long()
     member = one_hot(shape.label[thin], shape.num_parts).to(template)
-    depths, offsets = [], []
+    chosen, offsets = [], []
     for cloud in range(len(fields.values)):
-        table = offset_costs(template[thin], fields, cloud, direction)
+        table = offset_costs(template[thin], fields, cloud, direction, depths)
         cost = (member.T @ table.flatten(1)).unflatten(1, table.shape[1:])  # [K, depths, offsets]
         depth = cost.amin(dim=-1).sum(dim=0).argmin()
         best = cost[:, depth].argmin(dim=-1)  # [K]
         near = (_OFFSETS[best][:, None] - _OFFSETS).abs() < _APART
         second = cost[:, depth].masked_fill(near, torch.inf).argmin(dim=-1)
         others = torch.where(torch.eye(shape.num_parts, dtype=torch.bool), second, best)
-        depths.append(_DEPTHS[depth])
+        chosen.append(depths[depth])
         offsets.append(_OFFSETS[torch.cat([best[None], others])])
-    return torch.stack(depths).to(template), torch.stack(offsets).to(template)
+    return torch.stack(chosen).to(template), torch.stack(offsets).to(template)

@@ -123,7 +123,7 @@ def find_twin(
     read = [normalise_cloud(cloud, count, scale=scale) for cloud in clouds]
     points = torch.from_numpy(np.stack([one for one, _, _ in read])) if read else torch.zeros(0, count, 3)
     with flush_denormals():
-        found = find_one_object(points, num_parts, _JOINT_TYPES[joint], seed=seed)
+        found = find_one_object(points, num_parts, _JOINT_TYPES[joint], seed=seed, labelled=count)
     scans = tuple(_scan(found, i, points[i], cloud, read[i][1], scale) for i, cloud in enumerate(clouds))
     return Twin(scans, float(found.misfit.median()), found.unexplained)
 

@@ -1,10 +1,12 @@
 """From clouds of one object in several joint states to its parts, joints, and where they are in every cloud.
 
-1. *Coarse*: part discovery as for a category, with less effort, because all clouds show the same object.
-2. *Fine*, a few rounds: every point goes to the part with which it stays on the surface of all other clouds
-   (`moving_labels`), then poses, states and joint lines of all clouds are adjusted together (`adjustment`).
+1. *Coarse*: part discovery as for a category, with less effort, because all clouds show the same object. What slides
+   is first cut out by how it slides (`slide_search`).
+2. *Fine*, a few rounds: every point goes to the part with which it stays on the surface of all other clouds, there on
+   points that are of the same part (`moving_labels`), then poses, states and joint lines of all clouds are adjusted
+   together (`adjustment`).
 3. *Once more*, with all clouds placed alike (`stand_alike`); where it has one hinge, from where else that may be, too
-   (`hinge_search`). What fits better stays.
+   (`hinge_search`), and where parts slide, from where else they may be (`slide_search`). What fits better stays.
 4. *Fuse*: what all clouds show of a part, in canonical object space.
 
 That clouds show the same object is known here: the paper's method, and `discover`, do not use it.
@@ -13,7 +15,9 @@ That clouds show the same object is known here: the paper's method, and `discove
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -22,10 +26,12 @@ from torch import Tensor
 from articulate_ssl.discovery.discover import DiscoveryError, discover
 from articulate_ssl.discovery.one_object.adjustment import Placed, adjusted
 from articulate_ssl.discovery.one_object.hinge_search import has_one_hinge, turned_anew
-from articulate_ssl.discovery.one_object.moving_labels import CAP, believed, moving_costs, spread_labels
+from articulate_ssl.discovery.one_object.moving_labels import CAP, agreed, believed, moving_costs
+from articulate_ssl.discovery.one_object.slide_search import cut_by_slides, slid_anew, slide_alone
 from articulate_ssl.discovery.one_object.stand_alike import placed_alike, sought_alike
 from articulate_ssl.discovery.one_object.surface import Surface
 from articulate_ssl.discovery.options import DiscoveryOptions
+from articulate_ssl.discovery.registered_shape import RegisteredShape
 from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.geometry.screw import PRISMATIC
 from articulate_ssl.ops.farthest_point import farthest_point_order
@@ -35,7 +41,7 @@ from articulate_ssl.shape.articulated_shape import ArticulatedShape
 MIN_CLOUDS = 8  # as a choice: fewer were not tried
 _ROUNDS = 3  # of labels and adjustment; the third gained .003 of IoU on a chest, the second .07
 _POINTS = 1024  # of every cloud in these rounds
-LABELLED = 2048  # of every cloud in the end
+LABELLED = 2048  # of every cloud in the end, if not asked otherwise
 # Coarse discovery, in a sixth of the time that a category takes.
 _EFFORT = {"starts": 6, "rounds": 1, "cycles": 6}
 _REFERENCES = (1, 3)  # tried as the template; more where one leaves too much unexplained
@@ -86,11 +92,13 @@ def find_one_object(
     joint_type: int,
     part_points: int = 1024,
     seed: int = 0,
+    labelled: int = LABELLED,
 ) -> OneObject:
     """Parts and joints of the object that all clouds show, and its pose and joint states in each of them.
 
     Args:
         part_points: Fused points of each part.
+        labelled: How many points of every cloud get a label in the end.
         seed: Of everything random.
 
     Raises:
@@ -100,10 +108,9 @@ def find_one_object(
         raise DiscoveryError(f"{len(clouds)} clouds of one object, at least {MIN_CLOUDS} are needed: scan more states")
     surfaces = [Surface.of(cloud) for cloud in clouds.double().numpy()]
     best, refused = None, None
-    for references in _REFERENCES:
-        options = DiscoveryOptions(clouds=len(clouds), references=references, seed=seed, **_EFFORT)
+    for coarse in _coarse_ways(clouds.float(), num_parts, joint_type, seed):
         try:
-            found = _attempt(clouds.float(), surfaces, num_parts, joint_type, part_points, options)
+            found = _attempt(coarse, surfaces, part_points, labelled)
         except DiscoveryError as error:
             refused = error
             continue
@@ -117,35 +124,41 @@ def find_one_object(
     return best
 
 
+def _coarse_ways(clouds: Tensor, num_parts: int, joint_type: int, seed: int) -> Iterator[Callable[[], RegisteredShape]]:
+    """Ways to split the object, the likeliest first."""
+    efforts = [DiscoveryOptions(clouds=len(clouds), references=r, seed=seed, **_EFFORT) for r in _REFERENCES]
+    if joint_type == PRISMATIC:
+        yield partial(cut_by_slides, clouds, num_parts, efforts[0])
+    for effort in efforts:
+        yield partial(discover, clouds, num_parts, joint_type, effort)
+
+
 def _attempt(
-    clouds: Tensor,
-    surfaces: list[Surface],
-    num_parts: int,
-    joint_type: int,
-    part_points: int,
-    options: DiscoveryOptions,
+    coarse: Callable[[], RegisteredShape], surfaces: list[Surface], part_points: int, labelled: int
 ) -> OneObject:
     """One way to split the object, made exact."""
     _announce(0, "parts")
-    found = discover(clouds, num_parts, joint_type, options)
+    found = coarse()
     joints = found.shape.joints
     joints = replace(joints, axis=joints.axis.double(), pivot=joints.pivot.double())
-    one = refined(surfaces, Placed(joints, found.base.double(), found.state.double()), part_points)
-    return _asked_again(one, surfaces, part_points)
+    placed = Placed(joints, found.base.double(), found.state.double())
+    return _asked_again(refined(surfaces, placed, part_points, labelled=labelled), surfaces, part_points)
 
 
 def _asked_again(one: OneObject, surfaces: list[Surface], part_points: int) -> OneObject:
-    """The object with all clouds placed alike, a hinge where a search leads, if its clouds then fit better."""
+    """The object with all clouds placed alike, hinge or slides where a search leads, if its clouds then fit better."""
     placed = Placed(replace(one.shape.joints, limits=None), one.base, one.state)
     if has_one_hinge(placed.joints):
         alike = placed_alike(placed, one.shape, surfaces)
         anew = turned_anew(alike, surfaces) or alike
     else:
         anew = sought_alike(placed, one.shape, surfaces)
+        if slide_alone(placed.joints):
+            anew = slid_anew(anew, one.shape, surfaces)
     if anew is placed:
         return one
     try:
-        other = refined(surfaces, anew, part_points)
+        other = refined(surfaces, anew, part_points, labelled=one.label.shape[1])
     except DiscoveryError:
         return one
     return min((one, other), key=lambda found: float(found.misfit.mean()))
@@ -156,6 +169,7 @@ def refined(
     placed: Placed,  # float64, roughly
     part_points: int,
     votes: np.ndarray | None = None,  # [n, N, K] shares of what else says which parts their leading points are of
+    labelled: int = LABELLED,
 ) -> OneObject:
     """Labels and adjustment in turn, then the object. With votes, parts keep their names, and a base its own.
 
@@ -174,7 +188,7 @@ def refined(
             label = _kept_parts(probability)
         placed = adjusted(placed, thin, label)
     _announce(_COARSE_STAGES + _ROUNDS, "fusing")
-    cost, probability = _labelled(surfaces, placed, LABELLED, votes)
+    cost, probability = _labelled(surfaces, placed, labelled, votes)
     label = _kept_parts(probability)
     return _fused(placed, surfaces, label, probability, cost, part_points)
 
@@ -190,7 +204,7 @@ def _labelled(
     count = min(count, len(surfaces[0].points))
     cost = moving_costs(surfaces, placed.pose.numpy(), count)
     said = believed(cost, None if votes is None else votes[:, :count])
-    return cost, np.stack([spread_labels(s.thinned(count), own) for s, own in zip(surfaces, said, strict=True)])
+    return cost, agreed([surface.thinned(count) for surface in surfaces], placed.pose.numpy(), said)
 
 
 def _kept_parts(probability: np.ndarray) -> np.ndarray:
@@ -215,7 +229,7 @@ def rooted_at(placed: Placed, root: int) -> Placed:
     What slides slides against any other part: the one that moved least in the clouds need not be the body.
     """
     joints, chain = placed.joints, placed.joints.chain
-    sliding = joints.joint_type == PRISMATIC and set(chain.parent) == {chain.root}
+    sliding = slide_alone(joints)
     if chain.root == root or not (sliding or chain.num_parts == 2):
         return placed
     children = tuple(part for part in range(chain.num_parts) if part != root)

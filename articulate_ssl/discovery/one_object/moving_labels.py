@@ -3,13 +3,19 @@
 A point moved with its own part lies on the surface of every other cloud; moved with another part it does not, but for
 faces that slide along themselves, which only their ends give away. Labels therefore spread along faces: a random walk
 between neighbours on one plane, absorbed by what points say about themselves (Grady 2006, with priors).
+
+A face that slides along itself is on the surface with any part, and chance decides, in each cloud otherwise. But points
+of two clouds that lie on each other, moved with a part, are of that part in both or in none: so a point asks those that
+it lies on in all other clouds, part by part, what they are (`agreed`).
 """
 
 from __future__ import annotations
 
+from itertools import permutations
+
 import numpy as np
 from scipy.sparse import coo_matrix, diags, eye
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from articulate_ssl.discovery.one_object.surface import Surface
 
@@ -25,6 +31,11 @@ _SURPRISE = 0.02  # share of votes that a part has which none is for. Chosen.
 # How far labels spread that motion says: on chests of known poses, IoU .65 without, .73 at 10, .79 at 100, .83 at 300,
 # .74 at 1000.
 _SPREAD = 200.0
+# How often a point asks, how much answers count (as a power), and what is added to each. A CAD desk, whose drawers
+# stand beside walls, gained .07 of IoU, and .08 by a power of 4, by which a chest lost .03: errors confirm each other.
+_ASKED, _WEIGHT, _UNSAID = 3, 2, 0.02
+_NEAREST = 4  # points among which the one that is lain on is
+_ALIKE, _BESIDE = 0.8, 2.5  # least cosine between normals, and farthest, in spacings, of points that lie on each other
 
 
 def moving_costs(
@@ -65,7 +76,58 @@ def spread_labels(
     Args:
         spread: How far labels spread.
     """
-    count = len(said)
+    return _walk(surface, spread).solve(said)
+
+
+def agreed(
+    surfaces: list[Surface],  # n, of N points each
+    pose: np.ndarray,  # [n, K, 4, 4] canonical object space -> clouds
+    said: np.ndarray,  # [n, N, K] probability of every part, by what points say about themselves
+) -> np.ndarray:  # [n, N, K]
+    """The same for all points, by the faces that they are on and by those of other clouds that they lie on."""
+    lain_on, walks = _lain_on(surfaces, pose), [_walk(surface, _SPREAD) for surface in surfaces]
+    found = np.stack([walk.solve(own) for walk, own in zip(walks, said, strict=True)])
+    for _ in range(_ASKED):
+        # Of a point that lies on none, nothing is said: the last row.
+        known = np.concatenate([found, np.zeros_like(found[:, :1])], axis=1)
+        answers = _answers(known, lain_on)
+        own = said * (answers + _UNSAID) ** _WEIGHT
+        own /= own.sum(axis=-1, keepdims=True)
+        found = np.stack([walk.solve(one) for walk, one in zip(walks, own, strict=True)])
+    return found
+
+
+def _answers(known: np.ndarray, lain_on: np.ndarray) -> np.ndarray:  # [n, N + 1, K] -> [n, N, K]
+    """Mean over the other clouds of how likely the points that are lain on, moved with a part, are of that part."""
+    clouds, parts = range(len(known)), range(known.shape[-1])
+    total = [
+        [sum(known[other, lain_on[own, other, part], part] for other in clouds if other != own) for part in parts]
+        for own in clouds
+    ]
+    return np.moveaxis(np.array(total), 1, -1) / (len(known) - 1)
+
+
+def _lain_on(surfaces: list[Surface], pose: np.ndarray) -> np.ndarray:  # [n, n, K, N]
+    """Which point of every other cloud each point lies on, moved with every part; N where it lies on none."""
+    n, parts, count = len(surfaces), pose.shape[1], len(surfaces[0].points)
+    back, rows = np.linalg.inv(pose), np.arange(count)
+    found = np.full((n, n, parts, count), count)
+    for own, other in permutations(range(n), 2):
+        on = surfaces[other]
+        for part in range(parts):
+            moved = surfaces[own].moved(pose[other, part] @ back[own, part])
+            distance, index = on.tree.query(moved.points, k=_NEAREST)
+            cosine = np.abs(np.einsum("qki,qi->qk", on.normals[index], moved.normals))
+            distance = np.where(cosine > _ALIKE, distance, np.inf)
+            best = distance.argmin(axis=1)
+            near = distance[rows, best] < _BESIDE * on.spacing
+            found[own, other, part] = np.where(near, index[rows, best], count)
+    return found
+
+
+def _walk(surface: Surface, spread: float) -> SuperLU:
+    """What tells, of what all points of a cloud say, what is heard at each."""
+    count = len(surface.points)
     index = surface.tree.query(surface.points, k=min(_NEIGHBOURS + 1, count))[1][:, 1:]
     rows, columns = np.repeat(np.arange(count), index.shape[1]), index.ravel()
     step = surface.points[rows] - surface.points[columns]
@@ -75,4 +137,4 @@ def spread_labels(
     walk = coo_matrix((weight, (rows, columns)), shape=(count, count)).tocsr()
     walk = walk.maximum(walk.T)
     laplacian = diags(np.asarray(walk.sum(axis=1)).ravel()) - walk
-    return splu((spread * laplacian + eye(count)).tocsc()).solve(said)
+    return splu((spread * laplacian + eye(count)).tocsc())

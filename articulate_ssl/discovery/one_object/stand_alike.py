@@ -40,6 +40,8 @@ _COMPARED = 512  # points of a cloud that are compared with other clouds; where 
 _SAME = 0.3  # radians: what is turned by less is the same way
 _NEAR = 0.1  # normalised units: what a hinge is moved by less is where it was
 _SWEEPS = 5  # through the clouds, at most
+# Of descent, by which a part is turned onto another: by more, what only one of them has pulls both along their faces.
+_ITERATIONS = 12
 
 
 def placed_alike(
@@ -139,7 +141,7 @@ def _exactly(turn: Tensor, body: Tensor, part: Tensor) -> Tensor:
     start = Placed(Joints.none(1, turn), torch.stack([torch.eye(4).to(turn), turn]), turn.new_zeros(2, 0))
     count = min(len(body), len(part))
     surfaces = [Surface.of(points[:count].double().numpy()) for points in (body, part)]
-    base = adjusted(start, surfaces, np.zeros((2, count), dtype=int)).base
+    base = adjusted(start, surfaces, np.zeros((2, count), dtype=int), _ITERATIONS).base
     return base[1] @ invert_se3(base[0])
 
 

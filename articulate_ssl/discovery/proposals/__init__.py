@@ -31,6 +31,7 @@ class Scene(NamedTuple):
         observation: How far objects are turned.
         generator: Of everything random.
         framed: Whether template and clouds stand in a frame that all have in common, along its axes.
+        same_object: Whether all show one object, and none is deeper than another.
     """
 
     template: Tensor
@@ -41,6 +42,7 @@ class Scene(NamedTuple):
     observation: Observation
     generator: torch.Generator
     framed: bool = False
+    same_object: bool = False
 
     @property
     def thin(self) -> Tensor:

@@ -8,7 +8,10 @@ from articulate_ssl.discovery.distance_field import DistanceFields
 from articulate_ssl.discovery.proposals import Scene, Split
 from articulate_ssl.discovery.registered_shape import RegisteredShape
 from articulate_ssl.discovery.slide_table import (
+    DEPTHS,
     DIRECTIONS,
+    SAME_DEPTH,
+    SAME_EXTENT,
     Direction,
     Slides,
     Standing,
@@ -16,6 +19,7 @@ from articulate_ssl.discovery.slide_table import (
     offset_costs,
     place,
 )
+from articulate_ssl.discovery.synchronization import unit_boxes
 from articulate_ssl.geometry.kinematic_chain import KinematicChain
 from articulate_ssl.geometry.screw import PRISMATIC
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
@@ -34,14 +38,18 @@ def propose(scene: Scene) -> list[Split]:
 
 def _propose(scene: Scene, direction: Direction) -> Split | None:
     options, template = scene.options, scene.template
-    own, standing = Standing.of(template[None], direction), Standing.of(scene.aligned, direction)
+    unit = float(unit_boxes(scene.aligned)[2].max()) / SAME_EXTENT if scene.same_object else None
+    own, standing = Standing.of(template[None], direction, unit), Standing.of(scene.aligned, direction, unit)
     fields, clouds = DistanceFields.of(standing.points), range(len(scene.aligned))
-    table = torch.stack([offset_costs(own.points[0], fields, cloud, direction) for cloud in clouds], dim=1)
-    slides = cluster_slides(table, scene.num_parts, options.min_share, _RESTARTS, scene.generator)
+    depths = SAME_DEPTH if scene.same_object else DEPTHS
+    table = torch.stack([offset_costs(own.points[0], fields, cloud, direction, depths) for cloud in clouds], dim=1)
+    slides = cluster_slides(table, scene.num_parts, options.min_share, _RESTARTS, scene.generator, depths)
     if slides is None:
         return None
     shape = _star(template, slides, direction, float(own.width[0, direction.axis]))
-    base, state, log_stretch = (value[:, 0] for value in place(shape, scene.aligned, options.points, fields))
+    base, state, log_stretch = (
+        value[:, 0] for value in place(shape, scene.aligned, options.points, fields, depths, unit)
+    )
     error = torch.full((len(base),), slides.cost).to(template)
     axes = torch.eye(3).to(template).expand(scene.num_parts, 3, 3)
     return Split(slides.label, refined=False, registered=RegisteredShape(shape, base, state, log_stretch, error, axes))

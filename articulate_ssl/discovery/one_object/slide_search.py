@@ -1,0 +1,133 @@
+"""Parts of one object that slide: cut out by how they slide, and looked for everywhere along that.
+
+The discovery of a category lets objects stretch, and descends on labels, by which an object with small drawers loses
+one. Here all clouds show one object: what slides alike in a frame that they have in common
+(`discovery.proposals.slides`) is a part, and where it is in each cloud is one number, of which all can be tried.
+Descent does not leave a place where the front of a drawer lies on another board.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from articulate_ssl.discovery.collection import Collection
+from articulate_ssl.discovery.discover import DiscoveryError
+from articulate_ssl.discovery.one_object.adjustment import Placed
+from articulate_ssl.discovery.one_object.surface import Surface
+from articulate_ssl.discovery.options import DiscoveryOptions
+from articulate_ssl.discovery.proposals import Scene
+from articulate_ssl.discovery.proposals.slides import propose
+from articulate_ssl.discovery.references import choose_references
+from articulate_ssl.discovery.registered_shape import RegisteredShape
+from articulate_ssl.discovery.slide_table import Direction
+from articulate_ssl.geometry.screw import PRISMATIC
+from articulate_ssl.shape.articulated_shape import ArticulatedShape
+from articulate_ssl.shape.joints import Joints
+from articulate_ssl.shape.observation import Observation
+
+# All chosen, not tuned.
+_POINTS = 4096  # of every cloud, with those of a typical cloud, of which pieces are cut, compared
+_CUT = 1024
+_REFERENCES = 3  # typical clouds. By one of them one chest's drawers went sideways (docs/experiments.md, step 328).
+_COMPARED = 512  # points of a cloud, and of every part, with states tried
+_FAR = 0.05  # normalised units: what is farther is no match
+_STEP = 0.01  # of states, in normalised units
+_MARGIN = 0.1  # how much farther than parts were seen they may be, in normalised units
+_SWEEPS = 5  # through the joints of a cloud, at most
+
+
+def slide_alone(joints: Joints) -> bool:
+    """Whether parts slide, each against the base."""
+    return joints.joint_type == PRISMATIC and set(joints.chain.parent) == {joints.chain.root}
+
+
+def cut_by_slides(
+    clouds: Tensor,  # [n, N, 3] of one object in any orientation
+    num_parts: int,
+    options: DiscoveryOptions,
+) -> RegisteredShape:
+    """Parts that slide along the axis of a common frame that typical clouds agree on; roughly registered to all.
+
+    Raises:
+        DiscoveryError: if clouds have no frame in common, or in none of them parts slide apart.
+    """
+    options, observation = replace(options, dense_points=_POINTS), Observation()
+    collection = Collection.of(clouds, PRISMATIC, options, observation)
+    if collection.frame is None:
+        raise DiscoveryError("the clouds have no frame in common, along whose axes parts could slide")
+    typical = collection.clouds[choose_references(collection.clouds, _REFERENCES), :_CUT]
+    generator = collection.registrar.generator
+    splits = []
+    for one in typical:
+        scene = Scene(one, collection.clouds, num_parts, PRISMATIC, options, observation, generator, True, True)
+        splits.append([split.registered for split in propose(scene)])
+    axes = [[_of_axis(axis, found) for found in splits] for axis in range(3)]
+    along = min(axes, key=lambda ways: sum(_cost(way) for way in ways))
+    best = min(along, key=_cost)
+    if best is None:
+        raise DiscoveryError(f"the clouds do not show {num_parts} parts that slide on their own")
+    return collection.as_given(best)
+
+
+def _of_axis(axis: int, found: Sequence[RegisteredShape]) -> RegisteredShape | None:
+    """Of what slides along one axis of the frame, either way, that which explains most."""
+    along = (one for one in found if Direction.of(one.shape.joints.axis[0]).axis == axis)
+    return min(along, key=_cost, default=None)
+
+
+def _cost(found: RegisteredShape | None) -> float:
+    return torch.inf if found is None else float(found.error.mean())
+
+
+def slid_anew(
+    placed: Placed,  # of n clouds, whose bodies are placed well
+    shape: ArticulatedShape,  # fused from them
+    surfaces: Sequence[Surface],  # n
+) -> Placed:
+    """The same bodies and lines, and in each cloud the states that explain it best, of all that may be.
+
+    If all stay, it is `placed` itself.
+    """
+    own = [_fused_part(shape, part) for part in range(shape.num_parts)]
+    low, high = placed.state.min() - _MARGIN, placed.state.max() + _MARGIN
+    trials = torch.arange(float(low), float(high), _STEP)
+    state = torch.stack([_best(placed, row, own, surface, trials) for row, surface in enumerate(surfaces)])
+    moved = (state - placed.state).abs() > _STEP  # less descent sees by itself
+    return replace(placed, state=torch.where(moved, state, placed.state)) if moved.any() else placed
+
+
+def _fused_part(shape: ArticulatedShape, part: int) -> Surface:
+    points = shape.part(part).double().numpy()
+    return Surface.of(points)
+
+
+def _best(placed: Placed, row: int, parts: Sequence[Surface], surface: Surface, trials: Tensor) -> Tensor:  # [J]
+    """The states of a cloud at which both are nearest each other: a cloud's point is near one of the parts."""
+    joints, body = placed.joints, np.linalg.inv(placed.base[row].numpy())
+    cloud, resting = surface.thinned(_COMPARED).moved(body), surface.moved(body)
+    rest = parts[joints.chain.root].nearest(cloud, _FAR)
+    there, back = [], []  # of every joint [trials, points], [trials]
+    for child, axis in zip(joints.chain.child, joints.axis.numpy(), strict=True):
+        own, thin = parts[child], parts[child].thinned(_COMPARED)
+        shifts = [axis * float(trial) for trial in trials]
+        there.append(np.stack([own.nearest(_shifted(cloud, -shift), _FAR) for shift in shifts]))
+        back.append(np.array([resting.nearest(_shifted(thin, shift), _FAR).mean() for shift in shifts]))
+    chosen = [int((trials - state).abs().argmin()) for state in placed.state[row]]
+    for _ in range(_SWEEPS):
+        before = chosen.copy()
+        for joint in range(len(chosen)):
+            others = [there[other][chosen[other]] for other in range(len(chosen)) if other != joint]
+            least = np.min([rest, *others], axis=0)
+            chosen[joint] = int((np.minimum(least, there[joint]).mean(axis=1) + back[joint]).argmin())
+        if chosen == before:
+            break
+    return trials[chosen].to(placed.state)
+
+
+def _shifted(surface: Surface, shift: np.ndarray) -> Surface:
+    return Surface(surface.points + shift, surface.normals)
