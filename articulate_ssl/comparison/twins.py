@@ -140,7 +140,7 @@ def measure_set(
             rows = evenly_chosen((instance == manifest.instances["test"].index(name)).nonzero()[:, 0], clouds)
             with shown():
                 kept = measure(dataset.__getitems__(rows.tolist()), name, seed)
-            out.mkdir(parents=True, exist_ok=True)
+            file.parent.mkdir(parents=True, exist_ok=True)  # ids may be paths
             with atomic_write(file) as stream:
                 stream.write((json.dumps({"effort": effort, **vars(kept)}, indent=1) + "\n").encode())
         found.append(kept)

@@ -39,7 +39,7 @@ def with_coarse_slides(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(slides, "_RESTARTS", 10)
 
 
-def true_object(points: Tensor, num_parts: int, joint_type: int, seed: int = 0) -> OneObject:
+def true_object(points: Tensor, num_parts: int, joint_type: int, seed: int = 0, labelled: int = 4096) -> OneObject:
     """The drawer as it is, in place of `find_one_object`, for tests of what is done with it."""
     data = drawer()
     size = (points.norm(dim=-1).mean() / data.points.norm(dim=-1).mean()).double()  # in normalised units
@@ -49,6 +49,6 @@ def true_object(points: Tensor, num_parts: int, joint_type: int, seed: int = 0) 
     joints = replace(shape.joints, axis=data.axis.double(), pivot=data.pivot.double() * size, limits=limits)
     shape = replace(shape, points=shape.points.double() * size, joints=joints)
     posed = shape.posed(base, state)
-    label = shape.label[torch.cdist(points.double(), posed).argmin(dim=-1)]
+    label = shape.label[torch.cdist(points[:, :labelled].double(), posed).argmin(dim=-1)]
     share = torch.nn.functional.one_hot(label, num_parts).double()
     return OneObject(shape, base, state, label, share, torch.zeros(label.shape))

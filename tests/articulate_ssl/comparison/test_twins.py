@@ -114,6 +114,15 @@ def test_every_object_is_measured_once_by_the_same_code(measured, capsys, tmp_pa
     assert len(measured("--seed", "1")[1]) == 2
 
 
+def test_ids_may_be_paths(measured, tmp_path):
+    """As those of a folder of folders are."""
+    file = next((tmp_path / "data").rglob("manifest.json"))
+    file.write_text(file.read_text().replace("test-1", "shelf/test-1"))
+    assert [one[0] for one in measured()[1]] == ["test-0", "shelf/test-1"]
+    assert (tmp_path / "out" / "laptop-procedural" / "shelf" / "test-1.json").is_file()
+    assert measured()[1] == []
+
+
 def test_bad_input_is_told(measured, capsys, tmp_path):
     assert measured("--objects", "test-0", "other")[0] == 2
     assert "has no other" in capsys.readouterr().err
