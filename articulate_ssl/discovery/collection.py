@@ -46,7 +46,7 @@ class Collection:
         generator = torch.Generator().manual_seed(options.seed)
         # Sliding says nothing about orientation, while free registration of what slides turns it wherever it likes.
         slides = joint_type == PRISMATIC and not observation.orientation.limited
-        frame = common_frame(clouds, generator) if slides else None
+        frame = common_frame(clouds, generator, observation.bidirectional) if slides else None
         clouds = clouds[:, : options.dense_points].contiguous()
         rotations = rotation_group(60).elements.to(clouds)
         rotations = rotations[observation.orientation.contains(rotations)]

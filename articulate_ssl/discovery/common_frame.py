@@ -23,13 +23,19 @@ log = logging.getLogger(__name__)
 def common_frame(
     clouds: Tensor,  # [n, N, 3] in any orientation
     generator: torch.Generator,
+    whole: bool = True,
 ) -> Tensor | None:  # [n, 3, 3]
-    """Rotations that turn all clouds alike, with their surfaces along the axes; None if they have no such frames."""
+    """Rotations that turn all clouds alike, with their surfaces along the axes; None if they have no such frames.
+
+    Args:
+        whole: Whether clouds show all sides, by which frames can be made sharper.
+    """
     rotation, angle = manhattan_frames(clouds, generator)
     log.info("Manhattan frames: normals %.1f degrees from their axes in the median", angle.median())
     if angle.median() > _LARGEST_ANGLE:
         return None
-    rotation = sharpened(clouds, rotation, generator)
+    if whole:
+        rotation = sharpened(clouds, rotation, generator)
     group = rotation_group(24)
     boxes, _, _ = unit_boxes(clouds @ rotation.mT)
     element = synchronise(pairwise_costs(boxes, group), group, generator)

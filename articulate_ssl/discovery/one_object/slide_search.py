@@ -26,6 +26,7 @@ from articulate_ssl.discovery.references import choose_references
 from articulate_ssl.discovery.registered_shape import RegisteredShape
 from articulate_ssl.discovery.slide_table import Direction
 from articulate_ssl.geometry.screw import PRISMATIC
+from articulate_ssl.geometry.se3 import se3
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 from articulate_ssl.shape.joints import Joints
 from articulate_ssl.shape.observation import Observation
@@ -85,30 +86,49 @@ def _cost(found: RegisteredShape | None) -> float:
 
 
 def slid_anew(
-    placed: Placed,  # of n clouds, whose bodies are placed well
+    placed: Placed,  # of n clouds, most of whose bodies are placed well
     shape: ArticulatedShape,  # fused from them
     surfaces: Sequence[Surface],  # n
 ) -> Placed:
-    """The same bodies and lines, and in each cloud the states that explain it best, of all that may be.
+    """The same lines, and in each cloud the states that explain it best, of all that may be, also upside down.
 
     If all stay, it is `placed` itself.
     """
-    own = [_fused_part(shape, part) for part in range(shape.num_parts)]
-    low, high = placed.state.min() - _MARGIN, placed.state.max() + _MARGIN
-    trials = torch.arange(float(low), float(high), _STEP)
-    state = torch.stack([_best(placed, row, own, surface, trials) for row, surface in enumerate(surfaces)])
-    moved = (state - placed.state).abs() > _STEP  # less descent sees by itself
-    return replace(placed, state=torch.where(moved, state, placed.state)) if moved.any() else placed
+    own = [Surface.of(shape.part(part).double().numpy()) for part in range(shape.num_parts)]
+    trials = torch.arange(float(placed.state.min()) - _MARGIN, float(placed.state.max()) + _MARGIN, _STEP)
+    over = _turned_over(placed, shape)
+    base, state = placed.base.clone(), placed.state.clone()
+    for row, surface in enumerate(surfaces):
+        ways = [_best(placed.joints, body, state[row], own, surface, trials) for body in (base[row], over[row])]
+        if ways[1][0] < ways[0][0]:
+            base[row], state[row] = over[row], ways[1][1]
+        else:
+            moved = (ways[0][1] - state[row]).abs() > _STEP  # less descent sees by itself
+            state[row] = torch.where(moved, ways[0][1], state[row])
+    return placed if torch.equal(state, placed.state) else replace(placed, base=base, state=state)
 
 
-def _fused_part(shape: ArticulatedShape, part: int) -> Surface:
-    points = shape.part(part).double().numpy()
-    return Surface.of(points)
+def _turned_over(placed: Placed, shape: ArticulatedShape) -> Tensor:  # [n, 4, 4]
+    """Bodies that are turned by half about the way that drawers take, which chests nearly look alike by."""
+    axis, body = placed.joints.axis[0], shape.part(placed.joints.chain.root).to(placed.base)
+    middle = (body.amin(dim=0) + body.amax(dim=0)) / 2
+    turn = 2 * axis[:, None] * axis - torch.eye(3).to(axis)
+    return placed.base @ se3(turn, middle - turn @ middle)
 
 
-def _best(placed: Placed, row: int, parts: Sequence[Surface], surface: Surface, trials: Tensor) -> Tensor:  # [J]
-    """The states of a cloud at which both are nearest each other: a cloud's point is near one of the parts."""
-    joints, body = placed.joints, np.linalg.inv(placed.base[row].numpy())
+def _best(
+    joints: Joints,
+    base: Tensor,  # [4, 4]
+    state: Tensor,  # [J] from which the search starts
+    parts: Sequence[Surface],
+    surface: Surface,
+    trials: Tensor,
+) -> tuple[float, Tensor]:  # [J]
+    """How far a cloud and the parts are from each other, and the states at which they are nearest.
+
+    A point of the cloud is as far as the nearest part is.
+    """
+    body = np.linalg.inv(base.numpy())
     cloud, resting = surface.thinned(_COMPARED).moved(body), surface.moved(body)
     rest = parts[joints.chain.root].nearest(cloud, _FAR)
     there, back = [], []  # of every joint [trials, points], [trials]
@@ -117,16 +137,18 @@ def _best(placed: Placed, row: int, parts: Sequence[Surface], surface: Surface, 
         shifts = [axis * float(trial) for trial in trials]
         there.append(np.stack([own.nearest(_shifted(cloud, -shift), _FAR) for shift in shifts]))
         back.append(np.array([resting.nearest(_shifted(thin, shift), _FAR).mean() for shift in shifts]))
-    chosen = [int((trials - state).abs().argmin()) for state in placed.state[row]]
+    chosen = [int((trials - one).abs().argmin()) for one in state]
     for _ in range(_SWEEPS):
         before = chosen.copy()
         for joint in range(len(chosen)):
             others = [there[other][chosen[other]] for other in range(len(chosen)) if other != joint]
-            least = np.min([rest, *others], axis=0)
-            chosen[joint] = int((np.minimum(least, there[joint]).mean(axis=1) + back[joint]).argmin())
+            costs = np.minimum(np.min([rest, *others], axis=0), there[joint]).mean(axis=1) + back[joint]
+            chosen[joint] = int(costs.argmin())
         if chosen == before:
             break
-    return trials[chosen].to(placed.state)
+    near = np.min([rest, *(own[index] for own, index in zip(there, chosen, strict=True))], axis=0).mean()
+    cost = float(near) + sum(float(own[index]) for own, index in zip(back, chosen, strict=True))
+    return cost, trials[chosen].to(state)
 
 
 def _shifted(surface: Surface, shift: np.ndarray) -> Surface:

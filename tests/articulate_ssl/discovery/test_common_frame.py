@@ -29,18 +29,19 @@ def _chests() -> Tensor:  # [n, 4096, 3]
     return torch.stack(clouds)
 
 
+@pytest.mark.parametrize(("whole", "degrees"), [(True, 2), (False, 10)], ids=["whole", "views"])
 @pytest.mark.parametrize("noise", [0.0, 0.005])
-def test_generated_chests_share_a_frame(noise):
+def test_generated_chests_share_a_frame(noise, whole, degrees):
     """Boards are thin: neighbours lie on their other sides, so that few neighbourhoods are planes."""
     generator = torch.Generator().manual_seed(0)
     torch.manual_seed(0)
     turn = roma.random_rotmat(_CHESTS)
     clouds = _chests()
     clouds = clouds @ turn.mT + noise * torch.randn(clouds.shape, generator=generator)
-    frame = common_frame(clouds, generator)
+    frame = common_frame(clouds, generator, whole)
     assert frame is not None
     along = (frame @ turn).abs().amax(dim=-1)  # an axis of the frame, and the nearest along which chests are made
-    assert along.min() > np.cos(np.deg2rad(10))
+    assert along.min() > np.cos(np.deg2rad(degrees))
 
 
 def test_what_is_round_shares_none():

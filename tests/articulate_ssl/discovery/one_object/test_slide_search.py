@@ -12,6 +12,7 @@ from articulate_ssl.discovery.one_object.adjustment import Placed
 from articulate_ssl.discovery.one_object.slide_search import cut_by_slides, slid_anew, slide_alone
 from articulate_ssl.discovery.one_object.surface import Surface
 from articulate_ssl.discovery.options import DiscoveryOptions
+from articulate_ssl.geometry.se3 import se3
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
 
 
@@ -51,6 +52,19 @@ def test_drawers_are_found_where_no_descent_leads():
     assert (found.state - truth.state).abs().max() < 0.011  # as far as what is tried is apart
     others = [row for row in range(8) if row not in (2, 5)]
     assert torch.equal(found.state[others], truth.state[others]) and found.state[2, 1] == truth.state[2, 1]
+
+
+def test_a_chest_that_stands_upside_down_in_one_cloud_does_so_no_more():
+    _, shape, truth, surfaces = _world()
+    middle = torch.tensor([0.0, 0.3, 0.01]).double()  # of the floor
+    turn = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
+    base, state = truth.base.clone(), truth.state.clone()
+    base[3], state[3] = base[3] @ se3(turn, middle - turn @ middle), state[3].flip(0)
+    found = slid_anew(replace(truth, base=base, state=state), shape, surfaces)
+    torch.testing.assert_close(found.base, truth.base, atol=0.02, rtol=0)
+    assert (found.state - truth.state).abs().max() < 0.011
+    others = [row for row in range(8) if row != 3]
+    assert torch.equal(found.base[others], truth.base[others])
 
 
 def test_what_is_right_stays_as_it_is():
