@@ -25,7 +25,7 @@ _OFFSETS = 0.015 * torch.arange(-32, 33)  # up to two thirds of the width across
 DEPTHS = torch.tensor([0.7, 0.76, 0.82, 0.88, 0.94, 1.0, 1.06, 1.13, 1.2, 1.28, 1.36])  # over the template's
 # Of clouds of one object: their depth, and the largest extent of any, in the unit in which the fields hold all.
 SAME_DEPTH, SAME_EXTENT = torch.ones(1), 1.3
-_CAP = 0.06  # distances beyond count as this
+CAP = 0.06  # distances beyond count as this
 _NEIGHBOURS = 12  # points over which costs are averaged
 _DEPTH_ROUNDS, _PROFILE_ROUNDS = 3, 6
 _APART = 0.08  # offsets nearer than this are one
@@ -97,7 +97,7 @@ def offset_costs(
     height = (along - _BACK) * depths[:, None, None] + _BACK + _OFFSETS[:, None]  # [depths, offsets, T]
     slid = template.expand(*height.shape, 3).clone()
     slid[..., direction.axis] = direction.sign * height
-    return fields.at(cloud, slid).clamp(max=_CAP)[..., near].mean(dim=-1).permute(2, 0, 1)
+    return fields.at(cloud, slid).clamp(max=CAP)[..., near].mean(dim=-1).permute(2, 0, 1)
 
 
 class Slides(NamedTuple):

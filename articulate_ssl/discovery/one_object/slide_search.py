@@ -20,11 +20,11 @@ from articulate_ssl.discovery.discover import DiscoveryError
 from articulate_ssl.discovery.one_object.adjustment import Placed
 from articulate_ssl.discovery.one_object.surface import Surface
 from articulate_ssl.discovery.options import DiscoveryOptions
-from articulate_ssl.discovery.proposals import Scene
-from articulate_ssl.discovery.proposals.slides import propose
+from articulate_ssl.discovery.proposals import Scene, Split
+from articulate_ssl.discovery.proposals.slides import Stood, slid_apart
 from articulate_ssl.discovery.references import choose_references
 from articulate_ssl.discovery.registered_shape import RegisteredShape
-from articulate_ssl.discovery.slide_table import Direction
+from articulate_ssl.discovery.slide_table import CAP, DIRECTIONS
 from articulate_ssl.geometry.screw import PRISMATIC
 from articulate_ssl.geometry.se3 import se3
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
@@ -62,27 +62,29 @@ def cut_by_slides(
     if collection.frame is None:
         raise DiscoveryError("the clouds have no frame in common, along whose axes parts could slide")
     typical = collection.clouds[choose_references(collection.clouds, _REFERENCES), :_CUT]
-    generator = collection.registrar.generator
-    splits = []
-    for one in typical:
-        scene = Scene(one, collection.clouds, num_parts, PRISMATIC, options, observation, generator, True, True)
-        splits.append([split.registered for split in propose(scene)])
-    axes = [[_of_axis(axis, found) for found in splits] for axis in range(3)]
-    along = min(axes, key=lambda ways: sum(_cost(way) for way in ways))
+    generator, clouds = collection.registrar.generator, collection.clouds
+    scenes = [
+        Scene(one, clouds, num_parts, PRISMATIC, options, observation, generator, framed=True, same_object=True)
+        for one in typical
+    ]
+    axes = []
+    for axis in range(3):
+        ways = [Stood.of(scenes[0], direction) for direction in DIRECTIONS if direction.axis == axis]
+        axes.append([_cheaper(*(slid_apart(scene, stood) for stood in ways)) for scene in scenes])
+    along = min(axes, key=lambda found: sum(map(_cost, found)))
     best = min(along, key=_cost)
     if best is None:
         raise DiscoveryError(f"the clouds do not show {num_parts} parts that slide on their own")
     return collection.as_given(best)
 
 
-def _of_axis(axis: int, found: Sequence[RegisteredShape]) -> RegisteredShape | None:
-    """Of what slides along one axis of the frame, either way, that which explains most."""
-    along = (one for one in found if Direction.of(one.shape.joints.axis[0]).axis == axis)
-    return min(along, key=_cost, default=None)
+def _cheaper(*splits: Split | None) -> RegisteredShape | None:
+    """Of splits that there are, that which explains most."""
+    return min((split.registered for split in splits if split is not None), key=_cost, default=None)
 
 
 def _cost(found: RegisteredShape | None) -> float:
-    return torch.inf if found is None else float(found.error.mean())
+    return CAP if found is None else float(found.error.mean())
 
 
 def slid_anew(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 
 from articulate_ssl.discovery.distance_field import DistanceFields
@@ -28,19 +30,37 @@ from articulate_ssl.shape.joints import Joints
 _RESTARTS = 40  # random starts of a clustering
 
 
+class Stood(NamedTuple):
+    """Clouds as they stand for parts that slide along a direction.
+
+    Attributes:
+        unit: What becomes one, of clouds of one object; of several objects each has its own.
+        fields: Distances to them.
+    """
+
+    direction: Direction
+    unit: float | None
+    fields: DistanceFields
+
+    @staticmethod
+    def of(scene: Scene, direction: Direction) -> Stood:
+        """The aligned clouds of a scene."""
+        unit = float(unit_boxes(scene.aligned)[2].max()) / SAME_EXTENT if scene.same_object else None
+        return Stood(direction, unit, DistanceFields.of(Standing.of(scene.aligned, direction, unit).points))
+
+
 def propose(scene: Scene) -> list[Split]:
     """The best clustering for every direction; none where clouds have no common frame, or joints turn."""
     if not scene.framed or scene.joint_type != PRISMATIC:
         return []
-    found = [_propose(scene, direction) for direction in DIRECTIONS]
+    found = [slid_apart(scene, Stood.of(scene, direction)) for direction in DIRECTIONS]
     return [split for split in found if split is not None]
 
 
-def _propose(scene: Scene, direction: Direction) -> Split | None:
-    options, template = scene.options, scene.template
-    unit = float(unit_boxes(scene.aligned)[2].max()) / SAME_EXTENT if scene.same_object else None
-    own, standing = Standing.of(template[None], direction, unit), Standing.of(scene.aligned, direction, unit)
-    fields, clouds = DistanceFields.of(standing.points), range(len(scene.aligned))
+def slid_apart(scene: Scene, stood: Stood) -> Split | None:
+    """The best clustering for a direction; None if a piece has too few points in all."""
+    options, template, (direction, unit, fields) = scene.options, scene.template, stood
+    own, clouds = Standing.of(template[None], direction, unit), range(len(scene.aligned))
     depths = SAME_DEPTH if scene.same_object else DEPTHS
     table = torch.stack([offset_costs(own.points[0], fields, cloud, direction, depths) for cloud in clouds], dim=1)
     slides = cluster_slides(table, scene.num_parts, options.min_share, _RESTARTS, scene.generator, depths)
