@@ -23,7 +23,7 @@ _NEIGHBOURS = 4  # candidates among which one with a like normal is looked for
 _ALIKE = 0.8  # least cosine between normals; chosen, not tuned
 # Of L-BFGS between two matchings. With 12 the axis of one CAD dishwasher, whose thin door says little about its tilt,
 # was 5.0 degrees off and .04 nearer with every matching; with 40 it is .7 off, with 100 1.2.
-ITERATIONS = 40
+_ITERATIONS = 40
 # Normalised units: matches beyond are none, matching by matching.
 _FARTHEST = (0.1, 0.06, 0.06, 0.03, 0.03, 0.015, 0.015, 0.015)
 _SOFTER = 5.0  # residuals beyond that part of the farthest match count linearly
@@ -53,7 +53,7 @@ def adjusted(
     placed: Placed,  # float64
     surfaces: list[Surface],  # n, of as many points each
     label: np.ndarray,  # [n, N]
-    iterations: int = ITERATIONS,
+    iterations: int = _ITERATIONS,
 ) -> Placed:
     """The same after a few rounds of matching and descent."""
     points = torch.from_numpy(np.stack([s.points for s in surfaces]))

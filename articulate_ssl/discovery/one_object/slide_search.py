@@ -32,8 +32,7 @@ from articulate_ssl.shape.joints import Joints
 from articulate_ssl.shape.observation import Observation
 
 # All chosen, not tuned.
-_POINTS = 4096  # of every cloud, with those of a typical cloud, of which pieces are cut, compared
-_CUT = 1024
+_CUT, _POINTS = 1024, 4096  # of a typical cloud, of which pieces are cut, and of every cloud that it is compared with
 _REFERENCES = 3  # typical clouds. By one of them one chest's drawers went sideways (docs/experiments.md, step 328).
 _COMPARED = 512  # points of a cloud, and of every part, with states tried
 _FAR = 0.05  # normalised units: what is farther is no match
@@ -107,7 +106,8 @@ def slid_anew(
         else:
             moved = (ways[0][1] - state[row]).abs() > _STEP  # less descent sees by itself
             state[row] = torch.where(moved, ways[0][1], state[row])
-    return placed if torch.equal(state, placed.state) else replace(placed, base=base, state=state)
+    alike = torch.equal(base, placed.base) and torch.equal(state, placed.state)
+    return placed if alike else replace(placed, base=base, state=state)
 
 
 def _turned_over(placed: Placed, shape: ArticulatedShape) -> Tensor:  # [n, 4, 4]
