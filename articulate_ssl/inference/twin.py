@@ -102,7 +102,7 @@ def find_twin(
 ) -> Twin:
     """Parts and joints of one object from eight or more complete scans of it in different states.
 
-    About half a minute of one core for twelve scans. All joints are of one type.
+    About a minute of one core for twelve scans. All joints are of one type.
 
     Args:
         num_parts: How many parts move on their own, the base included.
