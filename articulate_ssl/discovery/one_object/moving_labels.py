@@ -34,8 +34,6 @@ _SPREAD = 200.0
 # How often a point asks, how much answers count (as a power), and what is added to each. A CAD desk, whose drawers
 # stand beside walls, gained .07 of IoU, and .08 by a power of 4, by which a chest lost .03: errors confirm each other.
 _ASKED, _WEIGHT, _UNSAID = 3, 2, 0.02
-_NEAREST = 4  # points among which the one that is lain on is
-_ALIKE, _BESIDE = 0.8, 2.5  # least cosine between normals, and farthest, in spacings, of points that lie on each other
 
 
 def moving_costs(
@@ -110,18 +108,11 @@ def _answers(known: np.ndarray, lain_on: np.ndarray) -> np.ndarray:  # [n, N + 1
 def _lain_on(surfaces: list[Surface], pose: np.ndarray) -> np.ndarray:  # [n, n, K, N]
     """Which point of every other cloud each point lies on, moved with every part; N where it lies on none."""
     n, parts, count = len(surfaces), pose.shape[1], len(surfaces[0].points)
-    back, rows = np.linalg.inv(pose), np.arange(count)
-    found = np.full((n, n, parts, count), count)
+    back, found = np.linalg.inv(pose), np.full((n, n, parts, count), count)
     for own, other in permutations(range(n), 2):
-        on = surfaces[other]
         for part in range(parts):
             moved = surfaces[own].moved(pose[other, part] @ back[own, part])
-            distance, index = on.tree.query(moved.points, k=_NEAREST)
-            cosine = np.abs(np.einsum("qki,qi->qk", on.normals[index], moved.normals))
-            distance = np.where(cosine > _ALIKE, distance, np.inf)
-            best = distance.argmin(axis=1)
-            near = distance[rows, best] < _BESIDE * on.spacing
-            found[own, other, part] = np.where(near, index[rows, best], count)
+            found[own, other, part] = surfaces[other].under(moved)
     return found
 
 

@@ -20,6 +20,7 @@ _ALIKE = 0.8  # least cosine between the normals of a query and a sample on the 
 # Tangential distance to the nearest sample, in spacings, beyond which a query lies past the edge of the face. Chosen,
 # as are the other numbers here.
 _BEYOND = 2.0
+_ON = 2.5  # distance, in spacings, within which a query lies on a sample
 
 
 @dataclass(frozen=True)
@@ -78,3 +79,14 @@ class Surface:
         alike = np.abs(np.einsum("qki,qi->qk", self.normals[index], query.normals)) > _ALIKE
         error = np.where(alike, np.hypot(along, np.maximum(past, 0)), cap)
         return np.minimum(error.min(axis=1), cap)
+
+    def under(
+        self,
+        query: Surface,  # Q samples
+    ) -> np.ndarray:  # [Q]
+        """The sample that each oriented point lies on, the nearest of those that face as it does; N if on none."""
+        distance, index = self.tree.query(query.points, k=_NEIGHBOURS)
+        alike = np.abs(np.einsum("qki,qi->qk", self.normals[index], query.normals)) > _ALIKE
+        distance = np.where(alike, distance, np.inf)
+        rows, best = np.arange(len(index)), distance.argmin(axis=1)
+        return np.where(distance[rows, best] < _ON * self.spacing, index[rows, best], len(self.points))

@@ -5,6 +5,7 @@ import roma
 import torch
 from articulated_objects import DRAWER, OVEN, clouds
 
+from articulate_ssl.discovery import manhattan_frame
 from articulate_ssl.discovery.manhattan_frame import manhattan_frames, surface_normals
 from articulate_ssl.geometry.rotation_group import rotation_group
 
@@ -46,16 +47,14 @@ def test_normals_are_those_of_planes_and_edges_have_none():
     assert surface_normals(solid)[1].mean() < 0.05
 
 
-def test_where_no_window_sees_planes_enough_the_one_that_sees_most_counts():
-    """Two plates nearer to each other than points are, but at an edge: few neighbourhoods are thin."""
-    generator = _generator()
-    plates = torch.rand(1, 4000, 3, generator=generator) * torch.tensor([1.0, 1.0, 0.0])
-    plates[:, ::2, 2] = 0.03 * torch.rand(2000, generator=generator)
-    plates[:, 1::8, 2] = 0.0
-    normals, planar = surface_normals(plates)
-    share = float(planar.mean())
-    assert share > 0.02
-    assert (normals[planar.bool()][:, 2].abs() > 0.9).float().mean() > 0.9
+def test_where_no_window_sees_planes_enough_the_one_that_sees_most_counts(monkeypatch):
+    """Of a noisy plane few neighbours are never flat, and many are."""
+    plane = torch.rand(1, 4000, 3, generator=_generator()) * torch.tensor([1.0, 1.0, 0.0])
+    plane[..., 2] = 0.01 * torch.randn(4000, generator=_generator())
+    monkeypatch.setattr(manhattan_frame, "_ENOUGH", 1.1)
+    normals, planar = surface_normals(plane)
+    assert planar.mean() > 0.9
+    assert normals[planar.bool()][:, 2].abs().min() > 0.9
 
 
 def test_a_frame_is_not_made_of_a_few_planes():

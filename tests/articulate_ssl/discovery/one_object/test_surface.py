@@ -47,3 +47,11 @@ def test_a_moved_surface_is_as_far_from_a_moved_cloud():
     pose[:3, :3], pose[:3, 3] = np.linalg.qr(rng.standard_normal((3, 3)))[0], [1, 2, 3]
     before, after = (s.nearest(q, 0.1) for s, q in ((surface, query), (surface.moved(pose), query.moved(pose))))
     np.testing.assert_allclose(before, after, atol=1e-9)
+
+
+def test_a_point_lies_on_the_sample_below_it_that_faces_as_it_does_or_on_none():
+    plane, up, aside = _plane(0.0), [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]
+    near = plane.points[[7, 30]] + np.array([0, 0, 1e-4])
+    far = np.array([[0.5, 0.5, 1.0]])
+    query = Surface(np.concatenate([near, far, near[:1]]), np.array([up, up, up, aside]))
+    assert plane.under(query).tolist() == [7, 30, len(plane.points), len(plane.points)]
