@@ -51,17 +51,13 @@ class Looks(NamedTuple):
     def of(
         self,
         turn: Tensor,  # [B, C, 3, 3] base rotations
-    ) -> tuple[Tensor, Tensor, Tensor]:  # [B, C] bool, [B, C] bool, [B, C]
-        """Whether what is turned so looks right if it is hinged as most are, or anyhow; and how far in front it comes.
-
-        That is a logarithm: 0 for what looks likeliest; what is hinged elsewhere comes behind.
-        """
+    ) -> tuple[Tensor, Tensor]:  # [B, C], [B, C]
+        """How right what is turned so looks, if it is hinged as most are, or anyhow: 0 for what looks likeliest."""
         stands = turn[:, :, None] @ self.hinges.mT  # [B, C, W, 3, 3]
         near = torch.einsum("bcwij,bgij->bcwg", stands, self.rotation).argmax(dim=-1)
         likely = self.likely - self.likely.amax(dim=1, keepdim=True)
         found = likely.gather(1, near.flatten(1)).view(near.shape)
-        most, anyhow = found[..., 0], found.amax(dim=-1)
-        return most > -DECIDED, anyhow > -DECIDED, torch.where(most > -DECIDED, most, anyhow - 2 * DECIDED)
+        return found[..., 0], found.amax(dim=-1)
 
 
 class BoxTurns(WithSurface):

@@ -34,9 +34,10 @@ from articulate_ssl.inference.box_turns import BoxTurns, Looks
 from articulate_ssl.inference.candidates import ANOTHER_WAY, angle_to
 from articulate_ssl.inference.contest import CLEARLY, Contest
 from articulate_ssl.inference.final_fit import FinalFit
-from articulate_ssl.inference.hinge_sides import HingeSides
+from articulate_ssl.inference.hinge_sides import DECIDED, HingeSides
 from articulate_ssl.inference.state_range import StateRange
 from articulate_ssl.network.hypotheses import Hypotheses
+from articulate_ssl.ops.chamfer import nearest_distance
 
 # All chosen on development ovens (docs/experiments.md, step 274).
 _UNSURE = 0.5  # margins below
@@ -46,8 +47,32 @@ _POINTS, _SCALES, _ROUNDS = 128, (0.06, 0.03), 4  # of the registration
 # Of the width of a joint's range, beyond it: registration, before proportions, is as far off. Chosen.
 _REGISTERED = 0.15
 _AT_ONCE = 4  # clouds whose explanations take proportions: on a CPU, of one alone that takes three times as long
+_FITS = 10.0  # logarithm of how much likelier something is, by that of how much better it fits
+_ASKED = 1024  # points of a cloud, how far they are from what is tried: more than what is tried is fitted to
 # Of its largest extent the smallest of a box at least (bodies of the package: .66 to .83, plates: .07 and .09).
 _THICK = 0.25
+
+
+def unexplained(
+    one: Hypotheses,  # H = 1
+    dense: Tensor,  # [B, P, 3] farthest-point order
+) -> Tensor:  # [B]
+    """Root mean squares of how far clouds' points are from explanations of them.
+
+    A box that is closed fits a body better than one in like proportions whose shelf is elsewhere, and leaves a door
+    that hangs out of it without explanation. Those are few points, and far away: by mean distances the body outweighs
+    them (docs/experiments.md, step 334).
+    """
+    far = nearest_distance(dense[:, :_ASKED], one.posed()[:, 0].flatten(1, 2))
+    return far.square().mean(dim=1).sqrt()
+
+
+def _as_it_looks(
+    error: Tensor,  # [b]
+    looks: Tensor,  # [b] logarithms
+) -> Tensor:  # [b]
+    """Errors, as much larger as what has them looks less right."""
+    return error * (-looks / _FITS).exp()
 
 
 class _Squares(NamedTuple):
@@ -58,20 +83,20 @@ class _Squares(NamedTuple):
         state: [B, C, 1]
         allowed: [B, C] bool, which are tried.
         shown: [B, C] bool, which only count in joint states that training showed.
-        unseen: [B] bool, whether training did not show how the door of what is decided for stands.
-        asked: [B] bool, whether any are.
+        looks: [B, C] how right they look, a logarithm: 0 for what looks likeliest.
+        own: [B] the same of what is decided for.
+        asked: [B] bool, whether any are tried.
         least: [B] share of the error of what is decided for, that another has to be below to take its place.
-        then: [B, C] the same, of what took it.
     """
 
     base: Tensor
     state: Tensor
     allowed: Tensor
     shown: Tensor
-    unseen: Tensor
+    looks: Tensor
+    own: Tensor
     asked: Tensor
     least: Tensor
-    then: Tensor
 
     def rows(self, rows: Tensor) -> _Squares:
         """Some of the clouds."""
@@ -83,37 +108,22 @@ class _Squares(NamedTuple):
         looks: Looks,
         states: StateRange,
     ) -> _Squares:
-        """What looks wrong gives way to what looks right, unless it fits clearly better and as training showed it.
-
-        Of what looks right the likeliest comes first, and gives way to what fits clearly better: what looks about as
-        likely, or is hinged elsewhere than most objects are. Where a closed door is hinged, fits do not tell, so that
-        counts of open ones alone.
-        """
-        most, right, order = looks.of(self.base[..., :3, :3])
-        as_most, alike, rank = (value[:, 0] for value in looks.of(one.base[..., :3, :3]))
+        """Those that look right, likeliest first. How right they look counts as fits do."""
+        rotation = one.base[..., :3, :3]
+        most, likely = looks.of(self.base[..., :3, :3])
+        as_most, own = (value[:, 0] for value in looks.of(rotation))
         # Registration may leave a closed door open: what is hinged as most are is tried with it closed, too.
         closed = states.rest.to(self.state).expand_as(self.state)
         base, state = torch.cat([self.base] * 2, dim=1), torch.cat([self.state, closed], dim=1)
-        allowed = right & (most | states.showed(self.state, _REGISTERED))
-        allowed, shown = torch.cat([allowed, right & most], dim=1), torch.cat([~most] * 2, dim=1)
-        then = torch.full_like(order, CLEARLY)
-        then = torch.cat([then, torch.where(order < 0, then, 1.0)], dim=1)
-        order = torch.cat([order] * 2, dim=1).masked_fill(~allowed, -torch.inf)
+        right, stands = likely > -DECIDED, most > -DECIDED
+        allowed = torch.cat([right & (stands | states.showed(self.state, _REGISTERED)), right & stands], dim=1)
+        shown, likely = torch.cat([~stands] * 2, dim=1), torch.cat([likely] * 2, dim=1)
+        order = (likely - 2 * DECIDED * shown).masked_fill(~allowed, -torch.inf)
         order = order.argsort(dim=1, descending=True, stable=True)
         rows = torch.arange(len(order), device=order.device)[:, None]
-        # Where doors stand as training showed, fits that are clearly better are believed; where not, looks are.
-        against = torch.where(alike | ~self.unseen, 1 / CLEARLY, torch.inf)
-        believed = alike & ~(self.unseen & (rank < 0))
-        return _Squares(
-            base[rows, order],
-            state[rows, order],
-            allowed[rows, order],
-            shown[rows, order],
-            self.unseen,
-            torch.where(looks.decided, self.unseen, self.asked) | ~as_most,
-            torch.where(believed, self.least, against),
-            then[rows, order],
-        )
+        asked = torch.where(looks.decided, ~states.showed(one.state[:, 0]), self.asked) | (as_most <= -DECIDED)
+        ordered = (value[rows, order] for value in (base, state, allowed, shown, likely))
+        return _Squares(*ordered, own, asked, torch.ones_like(self.least))
 
 
 class SquareSearch:
@@ -165,7 +175,7 @@ class SquareSearch:
         looks = self.turns.looks(dense, frames, self._hinges())
         squares = squares.looking_right(one, looks, self.final.registration.states)
         one, rival, margin = self._tried(squares, one, rival, margin, points, dense)
-        confirmed = looks.decided & looks.of(one.base[..., :3, :3])[1][:, 0]
+        confirmed = looks.decided & (looks.of(one.base[..., :3, :3])[1][:, 0] > -DECIDED)
         sure = 2 * looks.likely.amax(dim=1).exp() - 1
         return one, rival, torch.where(confirmed, margin.maximum(sure), margin)
 
@@ -181,8 +191,8 @@ class SquareSearch:
         showed = self.final.registration.states.showed(one.state[:, 0])
         another = angle_to(one.base[..., :3, :3], base[:, 0, :3, :3])[:, 0] > ANOTHER_WAY
         every, least = torch.ones_like(state[..., 0], dtype=torch.bool), torch.where(showed, CLEARLY, 1.0)
-        asked = ~showed | another | (margin < _UNSURE)
-        return _Squares(base, state, every, ~every, ~showed, asked, least, every.to(least))
+        asked, looks = ~showed | another | (margin < _UNSURE), torch.zeros_like(state[..., 0])
+        return _Squares(base, state, every, ~every, looks, looks[:, 0], asked, least)
 
     def _tried(
         self,
@@ -196,16 +206,14 @@ class SquareSearch:
         """Explanations, or what fits better, once it has the clouds' proportions."""
         asked = squares.asked.nonzero()[:, 0]
         for rows in asked.split(_AT_ONCE) if len(asked) else ():
-            own, some = points[rows], squares.rows(rows)
-            start, first = one.rows(rows), torch.ones_like(some.asked)
-            contest = Contest(start, rival.rows(rows), margin[rows], self.final.distance(start, own), self._as_rival)
-            for k, (which, tried, error, allowed) in enumerate(self._fits(some, own, dense[rows])):
+            own, some, start = points[rows], squares.rows(rows), one.rows(rows)
+            error = _as_it_looks(unexplained(start, dense[rows]), some.own)
+            contest = Contest(start, rival.rows(rows), margin[rows], error, self._as_rival)
+            for which, tried, error, allowed in self._fits(some, own, dense[rows]):
                 tried = contest.one.with_rows(which, tried)
-                least = torch.where(first, some.least, some.then[:, k])
-                error = torch.full_like(least, torch.inf).index_copy(0, which, error)
-                allowed = torch.zeros_like(first).index_copy(0, which, allowed)
-                contest, won = contest.against(tried, error, allowed, least)
-                first = first.index_fill(0, won, False)
+                error = torch.full_like(some.least, torch.inf).index_copy(0, which, error)
+                allowed = torch.zeros_like(some.asked).index_copy(0, which, allowed)
+                contest, _ = contest.against(tried, error, allowed, some.least)
             one, rival = one.with_rows(rows, contest.one), rival.with_rows(rows, contest.rival)
             margin = margin.index_copy(0, rows, contest.margin)
         return one, rival, margin
@@ -223,7 +231,8 @@ class SquareSearch:
             return
         tried = final.articulated.category_at(squares.base[cloud, rank, None], squares.state[cloud, rank, None])
         tried = final.in_proportion(tried, points[cloud], dense[cloud])
-        error, state = final.distance(tried, points[cloud]), tried.state[:, 0]
+        error = _as_it_looks(unexplained(tried, dense[cloud]), squares.looks[cloud, rank])
+        state = tried.state[:, 0]
         allowed = states.contains(state) & (~squares.shown[cloud, rank] | states.showed(state))
         for k in range(int(rank.max()) + 1):
             some = (rank == k).nonzero()[:, 0]

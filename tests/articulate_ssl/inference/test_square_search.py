@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import pytest
 import roma
@@ -11,8 +12,9 @@ from true_category import final_fit
 
 from articulate_ssl.geometry.rotation_group import rotation_group
 from articulate_ssl.inference.box_turns import BoxTurns, Looks
+from articulate_ssl.inference import square_search
 from articulate_ssl.inference.hinge_sides import HingeSides
-from articulate_ssl.inference.square_search import SquareSearch
+from articulate_ssl.inference.square_search import SquareSearch, unexplained
 from articulate_ssl.inference.state_range import StateRange
 from articulate_ssl.shape.observation import Observation
 
@@ -101,9 +103,9 @@ def test_what_training_showed_gives_way_only_to_what_fits_clearly_better(search,
     monkeypatch.setattr(search, "_square", lambda *_: (turned[:, None], state[:, None]))
     error = {True: 1.0, False: 0.96}
     monkeypatch.setattr(
-        search.final,
-        "distance",
-        lambda one, _points: torch.full((len(one.base),), error[bool((_off(one, data) < 30).all())]),
+        square_search,
+        "unexplained",
+        lambda one, _dense: torch.full((len(one.base),), error[bool((_off(one, data) < 30).all())]),
     )
     search.final.registration.states.seen.copy_(torch.tensor([[0.0, 1.6]]))
     one, rival, margin = search.sought(right, right, torch.zeros(4), data.points, data.points)
@@ -112,6 +114,29 @@ def test_what_training_showed_gives_way_only_to_what_fits_clearly_better(search,
     one, rival, margin = search.sought(right, right, torch.zeros(4), data.points, data.points)
     assert (_off(one, data) > 60).all() and torch.equal(rival.base, right.base)
     torch.testing.assert_close(margin, torch.full((4,), 0.1))
+
+
+def test_what_leaves_a_door_without_explanation_is_farther_off_than_what_fits_a_body_roughly():
+    """By mean distances it would be nearer."""
+    torch.manual_seed(0)
+    body, door = torch.rand(2, 900, 3) * torch.tensor([1, 1, 0.0]), torch.rand(2, 60, 3) * 0.1 + 0.5
+    cloud = torch.cat([door, body], dim=1)
+    closed, rough = _Posed(body[:, None]), _Posed(cloud[:, None] + torch.tensor([0, 0, 0.05]))
+    both = [torch.cdist(cloud, one.posed()[:, 0].flatten(1, 2)).amin(dim=2) for one in (closed, rough)]
+    assert (both[0].mean(dim=1) < both[1].mean(dim=1)).all()
+    of = [unexplained(one, cloud) for one in (closed, rough)]
+    assert (of[0] > of[1]).all()
+    for said, far in zip(of, both, strict=True):
+        torch.testing.assert_close(said, far.square().mean(dim=1).sqrt(), atol=1e-4, rtol=0)
+
+
+class _Posed(NamedTuple):
+    """Explanations of which only this is asked: [B, K, M, 3]."""
+
+    points: torch.Tensor
+
+    def posed(self) -> torch.Tensor:
+        return self.points[:, None]
 
 
 def _looking_right(search, monkeypatch, data, odds):
@@ -129,19 +154,19 @@ def _fitting(search, monkeypatch, data, error):
     """The search, told how well what is turned as objects are fits; the rest does by 1."""
     right = [tuple(rotation.flatten().tolist()) for rotation in data.base[:, :3, :3]]
 
-    def distance(one, _points):
+    def unexplained(one, _dense):
         turned = [tuple(rotation.flatten().tolist()) for rotation in one.base[:, 0, :3, :3]]
         return torch.tensor([error if rotation in right else 1.0 for rotation in turned])
 
     monkeypatch.setattr(search.final, "in_proportion", lambda tried, *_: tried)
-    monkeypatch.setattr(search.final, "distance", distance)
+    monkeypatch.setattr(square_search, "unexplained", unexplained)
 
 
-@pytest.mark.parametrize("error", [2.0, 1.02])
-def test_what_looks_right_comes_first_and_what_looks_wrong_gives_way(search, data, monkeypatch, error):
-    """However well that fits where its door is too far closed; else unless it fits clearly better.
+@pytest.mark.parametrize("error", [3.0, 2.0, 1.02])
+def test_what_looks_right_counts_as_what_fits_does(search, data, monkeypatch, error):
+    """Of what is by 9 less likely errors are e^.9 times as large, or 2.46; of what is by 1, e^.1, or 1.11.
 
-    What is undecided stays, unless its door is too far closed and it fits hardly better.
+    What looks undecided is not asked, if its door stands as training showed it.
     """
     search.measure()
     wrong, state = _turned(data)
@@ -149,16 +174,19 @@ def test_what_looks_right_comes_first_and_what_looks_wrong_gives_way(search, dat
     _fitting(search, monkeypatch, data, error)
     squares = torch.stack([wrong, data.base], dim=1), torch.stack([state, data.state], dim=1)
     monkeypatch.setattr(search, "_square", lambda *_: squares)
-    said = _at(search, wrong, state)
-    one, rival, margin = search.sought(said, said, torch.full((4,), 0.9), data.points, data.points)
-    better = (wrong if error > 1.05 else data.base)[:2]
-    assert torch.equal(one.base[:2, 0], better) and torch.equal(one.base[2:], said.base[2:])
-    assert torch.equal(rival.base[:2, 0], (data.base if error > 1.05 else wrong)[:2])
-    torch.testing.assert_close(margin, torch.tensor([0.5 if error > 1.05 else math.tanh(4.5)] * 2 + [0.9] * 2))
+    said, sure = _at(search, wrong, state), torch.full((4,), 0.9)
+    one, rival, margin = search.sought(said, said, sure, data.points, data.points)
+    kept, better, worse = error > 2.46, data.base, wrong
+    if kept:
+        better, worse = worse, better
+    assert torch.equal(one.base[:2, 0], better[:2]) and torch.equal(one.base[2:], said.base[2:])
+    assert torch.equal(rival.base[:2, 0], worse[:2])
+    sides = 1 - math.exp(0.9) / error if kept else math.tanh(4.5)
+    torch.testing.assert_close(margin, torch.tensor([sides] * 2 + [0.9] * 2), atol=1e-3, rtol=0)
     closed = _at(search, wrong, data.state)
-    one, _, _ = search.sought(closed, closed, torch.full((4,), 0.9), data.points, data.points)
-    assert torch.equal(one.base[:2, 0], data.base[:2])
-    assert torch.equal(one.base[2:, 0], (data.base if error < 1.05 else wrong)[2:])
+    one, _, _ = search.sought(closed, closed, sure, data.points, data.points)
+    assert torch.equal(one.base[:2, 0], better[:2])
+    assert torch.equal(one.base[2:, 0], (data.base if error < 1.11 else wrong)[2:])
 
 
 def test_what_looks_right_as_training_showed_it_is_taken_as_it_is(search, data, monkeypatch):
@@ -176,9 +204,9 @@ def test_what_looks_right_as_training_showed_it_is_taken_as_it_is(search, data, 
 
 @pytest.mark.parametrize(
     "learnt, elsewhere, opened",
-    [(True, 0.9, 1), (True, 0.97, 1), (True, 1.1, 1), (False, 0.9, 1), (False, 0.97, 1), (True, 0.9, 0)],
+    [(True, 0.9, 1), (True, 1.1, 1), (False, 0.9, 1), (True, 0.9, 0)],
 )
-def test_hinges_at_other_sides_have_to_fit_clearly_better(search, data, monkeypatch, learnt, elsewhere, opened):
+def test_hinges_may_be_at_other_sides(search, data, monkeypatch, learnt, elsewhere, opened):
     """An object that stands as it looks may be hinged elsewhere, where some are; its explanation lies on its side.
 
     And its door stands as training showed: where a closed one is hinged, fits do not tell.
@@ -194,12 +222,12 @@ def test_hinges_at_other_sides_have_to_fit_clearly_better(search, data, monkeypa
     _fitting(search, monkeypatch, data, 1 / elsewhere)
     said = _at(search, _turned(data)[0], data.state)  # as training showed none
     one, _, _ = search.sought(said, said, torch.ones(4), data.points, data.points)
-    assert ((_off(one, data) > 30) == (learnt and elsewhere < 0.95 and bool(opened))).all()
-    # What is said to be hinged elsewhere, as training showed it, gives way only to what fits clearly better; where none
-    # is, it looks wrong, and stays only if it does itself.
+    assert ((_off(one, data) > 30) == (learnt and elsewhere < 1 and bool(opened))).all()
+    # What is said to be hinged elsewhere, as training showed it, gives way to what fits better; where none is, it looks
+    # wrong.
     said = _at(search, lies, torch.full_like(data.state, 1.0))
     one, _, _ = search.sought(said, said, torch.ones(4), data.points, data.points)
-    assert ((_off(one, data) > 30) == (1 / elsewhere > (0.95 if learnt else 1 / 0.95))).all()
+    assert ((_off(one, data) > 30) == (learnt and elsewhere < 1)).all()
 
 
 @pytest.mark.parametrize("where", ["views", "plates", "not faces", "no dense points"])
