@@ -36,11 +36,13 @@ class Looks(NamedTuple):
         rotation: [B, 24, 3, 3] canonical object space -> camera.
         likely: [B, 24] logarithms of probabilities.
         hinges: [W, 3, 3] turns about the door's normal, of hinges that are elsewhere than most; none comes first.
+        log_prior: [W] logarithms of the shares of objects that are hinged so.
     """
 
     rotation: Tensor
     likely: Tensor
     hinges: Tensor
+    log_prior: Tensor
 
     @property
     def decided(self) -> Tensor:
@@ -51,13 +53,16 @@ class Looks(NamedTuple):
     def of(
         self,
         turn: Tensor,  # [B, C, 3, 3] base rotations
-    ) -> tuple[Tensor, Tensor]:  # [B, C], [B, C]
-        """How right what is turned so looks, if it is hinged as most are, or anyhow: 0 for what looks likeliest."""
+    ) -> tuple[Tensor, Tensor, Tensor]:  # [B, C], [B, C], [B, C]
+        """How right what is turned so looks, if it is hinged as most are, or anyhow: 0 for what looks likeliest.
+
+        And how likely it is, by that and by how many are hinged so.
+        """
         stands = turn[:, :, None] @ self.hinges.mT  # [B, C, W, 3, 3]
         near = torch.einsum("bcwij,bgij->bcwg", stands, self.rotation).argmax(dim=-1)
         likely = self.likely - self.likely.amax(dim=1, keepdim=True)
         found = likely.gather(1, near.flatten(1)).view(near.shape)
-        return found[..., 0], found.amax(dim=-1)
+        return found[..., 0], found.amax(dim=-1), (found + self.log_prior).amax(dim=-1)
 
 
 class BoxTurns(WithSurface):
@@ -85,6 +90,7 @@ class BoxTurns(WithSurface):
         dense: Tensor,  # [B, P, 3] farthest-point order
         frames: Tensor,  # [B, 3, 3] camera -> frame of the clouds (`manhattan_frames`)
         hinges: Tensor | None = None,  # [W, 3, 3] see `Looks`; None: none is elsewhere
+        log_prior: Tensor | None = None,  # [W]; None: as many are hinged in any of these ways
         seen: Callable[[Tensor], Tensor] | None = None,
     ) -> Looks:
         """How right boxes look.
@@ -101,4 +107,5 @@ class BoxTurns(WithSurface):
         if seen is not None:
             looks = looks.masked_fill(~seen(rotation), -torch.inf)
         hinges = torch.eye(3)[None] if hinges is None else hinges
-        return Looks(rotation, looks.log_softmax(dim=1), hinges.to(frames))
+        log_prior = torch.zeros(len(hinges)) if log_prior is None else log_prior
+        return Looks(rotation, looks.log_softmax(dim=1), hinges.to(frames), log_prior.to(frames))

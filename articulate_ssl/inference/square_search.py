@@ -37,7 +37,6 @@ from articulate_ssl.inference.final_fit import FinalFit
 from articulate_ssl.inference.hinge_sides import DECIDED, HingeSides
 from articulate_ssl.inference.state_range import StateRange
 from articulate_ssl.network.hypotheses import Hypotheses
-from articulate_ssl.ops.chamfer import nearest_distance
 
 # All chosen on development ovens (docs/experiments.md, step 274).
 _UNSURE = 0.5  # margins below
@@ -47,24 +46,10 @@ _POINTS, _SCALES, _ROUNDS = 128, (0.06, 0.03), 4  # of the registration
 # Of the width of a joint's range, beyond it: registration, before proportions, is as far off. Chosen.
 _REGISTERED = 0.15
 _AT_ONCE = 4  # clouds whose explanations take proportions: on a CPU, of one alone that takes three times as long
-_FITS = 10.0  # logarithm of how much likelier something is, by that of how much better it fits
-_ASKED = 1024  # points of a cloud, how far they are from what is tried: more than what is tried is fitted to
+# Logarithm of how much likelier something is, by that of how much better it fits; 10 and 15 decide alike.
+_FITS = 12.0
 # Of its largest extent the smallest of a box at least (bodies of the package: .66 to .83, plates: .07 and .09).
 _THICK = 0.25
-
-
-def unexplained(
-    one: Hypotheses,  # H = 1
-    dense: Tensor,  # [B, P, 3] farthest-point order
-) -> Tensor:  # [B]
-    """Root mean squares of how far clouds' points are from explanations of them.
-
-    A box that is closed fits a body better than one in like proportions whose shelf is elsewhere, and leaves a door
-    that hangs out of it without explanation. Those are few points, and far away: by mean distances the body outweighs
-    them (docs/experiments.md, step 334).
-    """
-    far = nearest_distance(dense[:, :_ASKED], one.posed()[:, 0].flatten(1, 2))
-    return far.square().mean(dim=1).sqrt()
 
 
 def _as_it_looks(
@@ -83,7 +68,7 @@ class _Squares(NamedTuple):
         state: [B, C, 1]
         allowed: [B, C] bool, which are tried.
         shown: [B, C] bool, which only count in joint states that training showed.
-        looks: [B, C] how right they look, a logarithm: 0 for what looks likeliest.
+        looks: [B, C] how likely they are by their looks, a logarithm (`Looks.of`).
         own: [B] the same of what is decided for.
         asked: [B] bool, whether any are tried.
         least: [B] share of the error of what is decided for, that another has to be below to take its place.
@@ -110,15 +95,15 @@ class _Squares(NamedTuple):
     ) -> _Squares:
         """Those that look right, likeliest first. How right they look counts as fits do."""
         rotation = one.base[..., :3, :3]
-        most, likely = looks.of(self.base[..., :3, :3])
-        as_most, own = (value[:, 0] for value in looks.of(rotation))
+        most, anyhow, likely = looks.of(self.base[..., :3, :3])
+        as_most, _, own = (value[:, 0] for value in looks.of(rotation))
         # Registration may leave a closed door open: what is hinged as most are is tried with it closed, too.
         closed = states.rest.to(self.state).expand_as(self.state)
         base, state = torch.cat([self.base] * 2, dim=1), torch.cat([self.state, closed], dim=1)
-        right, stands = likely > -DECIDED, most > -DECIDED
+        right, stands = anyhow > -DECIDED, most > -DECIDED
         allowed = torch.cat([right & (stands | states.showed(self.state, _REGISTERED)), right & stands], dim=1)
         shown, likely = torch.cat([~stands] * 2, dim=1), torch.cat([likely] * 2, dim=1)
-        order = (likely - 2 * DECIDED * shown).masked_fill(~allowed, -torch.inf)
+        order = likely.masked_fill(~allowed, -torch.inf)
         order = order.argsort(dim=1, descending=True, stable=True)
         rows = torch.arange(len(order), device=order.device)[:, None]
         asked = torch.where(looks.decided, ~states.showed(one.state[:, 0]), self.asked) | (as_most <= -DECIDED)
@@ -172,7 +157,7 @@ class SquareSearch:
         squares = self._squares(one, margin, points, frames)
         if not self.turns.learnt:
             return self._tried(squares, one, rival, margin, points, dense)
-        looks = self.turns.looks(dense, frames, self._hinges())
+        looks = self.turns.looks(dense, frames, *self._hinges())
         squares = squares.looking_right(one, looks, self.final.registration.states)
         one, rival, margin = self._tried(squares, one, rival, margin, points, dense)
         confirmed = looks.decided & (looks.of(one.base[..., :3, :3])[1][:, 0] > -DECIDED)
@@ -207,7 +192,7 @@ class SquareSearch:
         asked = squares.asked.nonzero()[:, 0]
         for rows in asked.split(_AT_ONCE) if len(asked) else ():
             own, some, start = points[rows], squares.rows(rows), one.rows(rows)
-            error = _as_it_looks(unexplained(start, dense[rows]), some.own)
+            error = _as_it_looks(self.final.distance(start, own), some.own)
             contest = Contest(start, rival.rows(rows), margin[rows], error, self._as_rival)
             for which, tried, error, allowed in self._fits(some, own, dense[rows]):
                 tried = contest.one.with_rows(which, tried)
@@ -231,17 +216,21 @@ class SquareSearch:
             return
         tried = final.articulated.category_at(squares.base[cloud, rank, None], squares.state[cloud, rank, None])
         tried = final.in_proportion(tried, points[cloud], dense[cloud])
-        error = _as_it_looks(unexplained(tried, dense[cloud]), squares.looks[cloud, rank])
+        error = _as_it_looks(final.distance(tried, points[cloud]), squares.looks[cloud, rank])
         state = tried.state[:, 0]
         allowed = states.contains(state) & (~squares.shown[cloud, rank] | states.showed(state))
         for k in range(int(rank.max()) + 1):
             some = (rank == k).nonzero()[:, 0]
             yield cloud[some], tried.rows(some), error[some], allowed[some]
 
-    def _hinges(self) -> Tensor:  # [W, 3, 3]
-        """Turns about a door's normal, of hinges that are elsewhere than most, in canonical space; none comes first."""
+    def _hinges(self) -> tuple[Tensor, Tensor]:  # [W, 3, 3], [W]
+        """Turns about a door's normal, of hinges that are elsewhere than most, and logarithms of how many are so.
+
+        The turns are in canonical space; none comes first.
+        """
         quarters = self.sides.quarters if self.sides.learnt else self.sides.quarters[:1]
-        return roma.rotvec_to_rotmat(quarters[:, None] * (math.pi / 2) * self.sides.axes[:, 2])
+        turns = roma.rotvec_to_rotmat(quarters[:, None] * (math.pi / 2) * self.sides.axes[:, 2])
+        return turns, self.sides.log_prior[: len(quarters)]
 
     def _as_rival(self, one: Hypotheses) -> Hypotheses:
         """The category's own shape, as rivals have it, where an explanation has that which clouds have in common."""

@@ -37,7 +37,7 @@ def test_the_object_is_turned_as_a_frame_says(frames):
     right = torch.tensor([0, 3, 7, 11, 23])
     turns.surface = _Likes(right, 6.0)
     assert turns.learnt
-    rotation, likely, _ = turns.looks(torch.zeros(CLOUDS, 8, 3), frames, torch.eye(3)[None])
+    rotation, likely, *_ = turns.looks(torch.zeros(CLOUDS, 8, 3), frames, torch.eye(3)[None])
     every = frames.mT[:, None] @ rotation_group(24).elements.float()
     torch.testing.assert_close(rotation @ turns.axes, every)
     assert torch.equal(likely.argmax(dim=1), right)
@@ -57,16 +57,18 @@ def test_what_lies_on_its_side_may_look_right_where_some_are_hinged_there(frames
     every = frames.mT[:, None] @ rotation_group(24).elements.float()
     likely = torch.full((CLOUDS, 24), -9.0).index_fill(1, torch.tensor([4]), 1.0).index_fill(1, torch.tensor([9]), 0.0)
     quarter = roma.rotvec_to_rotmat(math.pi / 2 * torch.tensor([[0.0, 0, 0], [0, 0, 1]]))
-    looks = Looks(every, likely, quarter)
+    few = torch.tensor([0.0, -2.0])
+    looks = Looks(every, likely, quarter, few)
     assert not looks.decided.any()
     tilt = roma.rotvec_to_rotmat(torch.tensor([0.2, 0.1, -0.1]))  # as registration leaves it
     said = torch.stack([every[:, 4], every[:, 9], every[:, 4] @ quarter[1], every[:, 9] @ quarter[1]], dim=1) @ tilt
-    most, anyhow = looks.of(said)
+    most, anyhow, counted = looks.of(said)
     assert most.tolist() == [[0.0, -1.0, -10.0, -10.0]] * CLOUDS and anyhow.tolist() == [[0.0, -1.0] * 2] * CLOUDS
+    assert counted.tolist() == [[0.0, -1.0, -2.0, -3.0]] * CLOUDS
     assert (looks.of(every)[1] > -10).sum(dim=1).tolist() == [4] * CLOUDS
-    alone = Looks(every, likely, quarter[:1])
-    assert torch.equal(torch.stack(alone.of(said)), most.expand(2, -1, -1))
-    assert Looks(every, likely.index_fill(1, torch.tensor([9]), -1.5), quarter).decided.all()
+    alone = Looks(every, likely, quarter[:1], few[:1])
+    assert torch.equal(torch.stack(alone.of(said)), most.expand(3, -1, -1))
+    assert Looks(every, likely.index_fill(1, torch.tensor([9]), -1.5), quarter, few).decided.all()
 
 
 def test_weights_from_before_it_was_taught_have_none():
