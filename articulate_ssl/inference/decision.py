@@ -62,17 +62,13 @@ class Decision:
         points: Tensor,  # [B, N, 3]
         dense: Tensor,  # [B, P, 3]
         registers: bool,
-        networks: bool = True,
     ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
         """Of the two explanations of clouds the one that their relief favours, the other, and by how much.
 
-        Args:
-            networks: Those that were taught have a say, too.
+        Networks that were taught have a say, too.
         """
         twin, two_ways = self.twin(one, points, registers), self.two_ways
         odds = two_ways.relief_odds(self.relief(one, dense), self.relief(twin, dense))
-        if not networks:
-            return likelier(odds, one, twin, 1.0)
         if two_ways.surface is not None:
             odds = odds + two_ways.surface.log_odds(frames_of(one, twin), dense)
         if two_ways.near is not None:

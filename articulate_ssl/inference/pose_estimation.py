@@ -190,10 +190,33 @@ class PoseEstimator(Proposals):
         """
         return self._predicted(points, num_points, refine, dense, fits, rivals=True)
 
+    @torch.no_grad()
+    def search(
+        self,
+        points: Tensor,  # [B, N, 3] normalised, farthest-point order
+        dense: Tensor | None = None,  # [B, P, 3] the same clouds with all their points
+    ) -> Prediction:
+        """`predict`, registered, without the network of the paper: what that is worth.
+
+        Where it would propose hypotheses, the category's shape and joints are searched from everywhere
+        (`FinalFit.search`); where other clouds or views say where it is, nothing competes with them. All that is learnt
+        after training has its say.
+
+        Raises:
+            ValueError: if a cloud has NaN or infinite points.
+        """
+        return self._predicted(points, None, True, dense, fits=True, rivals=False)[0]
+
     def _predicted(
-        self, points: Tensor, num_points: int, refine: bool | None, dense: Tensor | None, fits: bool, rivals: bool
+        self,
+        points: Tensor,
+        num_points: int | None,
+        refine: bool | None,
+        dense: Tensor | None,
+        fits: bool,
+        rivals: bool,
     ) -> tuple[Prediction, Prediction]:
-        """See `predict_with_rivals`; without `rivals` the second is of no use."""
+        """See `predict_with_rivals`; without `rivals` the second is of no use. Without `num_points` see `search`."""
         if not torch.isfinite(points).all():
             raise ValueError("a cloud has NaN or infinite points")
         found, rival = self._decided(points, num_points, refine, dense, fits, rivals)
@@ -206,7 +229,13 @@ class PoseEstimator(Proposals):
             return says(found, points, dense), rival
 
     def _decided(
-        self, points: Tensor, num_points: int, refine: bool | None, dense: Tensor | None, fits: bool, rivals: bool
+        self,
+        points: Tensor,
+        num_points: int | None,
+        refine: bool | None,
+        dense: Tensor | None,
+        fits: bool,
+        rivals: bool,
     ) -> tuple[Prediction, Prediction]:
         """See `_predicted`: before a network says poses."""
         count, hands = len(points), self.handedness.hands
@@ -234,7 +263,13 @@ class PoseEstimator(Proposals):
         return self._explained(both_hands(points), num_points, None, None, False, False)[2].chunk(2)
 
     def _explained(
-        self, points: Tensor, num_points: int, refine: bool | None, dense: Tensor | None, fits: bool, rivals: bool
+        self,
+        points: Tensor,
+        num_points: int | None,
+        refine: bool | None,
+        dense: Tensor | None,
+        fits: bool,
+        rivals: bool,
     ) -> tuple[Prediction, Prediction, Tensor]:
         """See `_predicted`: by the category's own hand; and errors [B], by which hands are told apart.
 
@@ -303,7 +338,7 @@ class PoseEstimator(Proposals):
             return self._chosen(points, num_points, True, dense)[0]
 
     def _chosen(
-        self, points: Tensor, num_points: int, registers: bool, dense: Tensor | None
+        self, points: Tensor, num_points: int | None, registers: bool, dense: Tensor | None
     ) -> tuple[Hypotheses, Hypotheses, Tensor, Votes | None]:  # H = 1, H = 1, [B]
         """What is decided for, its rival, the margin between them, and parts of points as labelled clouds vote."""
         votes = None
@@ -349,15 +384,17 @@ class PoseEstimator(Proposals):
     def _candidates(
         self,
         points: Tensor,  # [B, N, 3]
-        num_points: int,
+        num_points: int | None,
         registers: bool,
         turn: Tensor | None = None,  # [B, 3, 3] canonical object space -> camera
     ) -> Candidates:
-        """The network's hypotheses, or the leading ones registered, in the frame of the points.
+        """The network's hypotheses, or the leading ones registered, or what is searched, in the frame of the points.
 
         Args:
             turn: Of those, hypotheses that are not turned about so are registered only where too few are.
         """
+        if num_points is None:
+            return self.final.search(points)
         if registers:
             aligned, pose = self.align(points[:, :num_points])
             *_, last = self.iterate(aligned)
@@ -372,19 +409,17 @@ class PoseEstimator(Proposals):
         self,
         points: Tensor,  # [B, N, 3]
         dense: Tensor,  # [B, P, 3]
-        num_points: int | None = None,
+        num_points: int | None,
     ) -> tuple[Hypotheses, Hypotheses, Tensor, Votes | None]:  # H = 1, H = 1, [B]
         """The category's shape where the search for sliding parts finds it, and its rival.
 
-        Which way round clouds are, the search decides; with `num_points` by a network, if that was taught, and the
-        network's hypotheses that are turned alike compete by their errors.
+        Which way round clouds are, the search decides; with `num_points` the network's hypotheses that are turned alike
+        compete by their errors.
 
         Returns:
             Both, the margin between them, and which parts labelled clouds say that points are of, if there are any.
         """
-        decides = num_points is not None
-        slid = self.sliding.search(self.articulated.category.chain(), dense, decides)
-        shape, base, state, margin, votes = slid
+        shape, base, state, margin, votes = self.sliding.search(self.articulated.category.chain(), dense)
         clouds, count = base.shape[:2]
         rows, parts = torch.arange(clouds, device=points.device), shape.points.unflatten(1, (shape.num_parts, -1))
 
@@ -397,7 +432,7 @@ class PoseEstimator(Proposals):
             return replace(found, shape=CanonicalShape(parts[own] - center[:, :, None], center), structure=structure)
 
         first, rival = select(torch.zeros_like(rows)), select(torch.ones_like(rows))
-        if not decides:
+        if num_points is None:
             return first, rival, margin, votes
         error = chamfer_l1(points, first.posed()[:, 0].flatten(1, 2), self.observation.bidirectional)
         others = self._candidates(points, num_points, registers=True)
@@ -407,18 +442,18 @@ class PoseEstimator(Proposals):
         self,
         points: Tensor,  # [B, N, 3]
         dense: Tensor | None,  # [B, P, 3]
-        num_points: int | None = None,
+        num_points: int | None,
     ) -> tuple[Hypotheses, Hypotheses, Tensor, Votes]:  # H = 1, H = 1, [B]
         """The category's shape, registered from where the search among simulated views finds it, and its rival.
 
-        Which way round objects are, the search decides; with `num_points` by a network, if that was taught, and the
+        Which way round objects are, the search decides, or a network, if that was taught; with `num_points` the
         articulated network's hypotheses that are turned alike compete by their errors.
 
         Returns:
             Both, the margin between them, and which parts the views say that points are of.
         """
         seen = self.view_search.search(points)
-        if num_points is not None and dense is not None and self.object_frame.surface is not None:
+        if dense is not None and self.object_frame.surface is not None:
             turn, margin, other = self.object_frame.looked_at(dense, seen.base[:, 0, :3, :3])
             seen, rows = seen._replace(margin=margin), other.nonzero()[:, 0]
             if len(rows):
@@ -432,53 +467,6 @@ class PoseEstimator(Proposals):
         turn = base[:, 0, :3, :3]
         chosen = better(first, error[:, 0], self._candidates(points, num_points, True, turn), turn)
         return chosen, rival, margin, votes
-
-    @torch.no_grad()
-    def search(
-        self,
-        points: Tensor,  # [B, N, 3] normalised, farthest-point order
-        dense: Tensor | None = None,  # [B, P, 3] the same clouds with all their points
-    ) -> Prediction:
-        """Predictions of the category's shape and joints alone: no network has a say, a decision by relief has.
-
-        They are searched from everywhere (`FinalFit.search`). Where parts slide, `sliding_search` takes the place of
-        that, if there are dense clouds, and `view_search` where simulated views taught.
-        """
-        count, hands = len(points), self.handedness.hands
-        every, error = self._searched(hands(points), None if dense is None else hands(dense))
-        if not self.handedness.learnt:
-            return every
-        seen, other, odds = every[:count], every[count:], self.handedness.log_odds(error[:count], error[count:])
-        return self.handedness.likelier((seen, seen), (other, other), odds)[0]
-
-    def _searched(self, points: Tensor, dense: Tensor | None) -> tuple[Prediction, Tensor]:
-        """See `search`: by the category's own hand; and errors [B] (see `_explained`)."""
-        with torch.autocast(points.device.type, enabled=False):
-            if self.view_search.learnt:
-                found, other, margin, votes = self._seen(points, dense)
-                return self._fitted(found, other, margin, points, dense, votes)
-            if dense is not None and self.sliding.learnt:
-                found, _, margin, votes = self._slid(points, dense)
-                return self._packaged(found, points, margin, votes, dense), self.final.distance(found, points)
-            found, other, margin = self._best(self.final.search(points))
-            if dense is not None and self.two_ways.learnt:
-                found, other, margin = self.decision.by_relief(found, points, dense, registers=True, networks=False)
-            return self._fitted(found, other, margin, points, dense)
-
-    def _fitted(
-        self,
-        one: Hypotheses,  # H = 1
-        rival: Hypotheses,  # H = 1
-        margin: Tensor,  # [B]
-        points: Tensor,  # [B, N, 3]
-        dense: Tensor | None,  # [B, P, 3]
-        votes: Votes | None = None,
-    ) -> tuple[Prediction, Tensor]:
-        """Explanations in the clouds' proportions, packaged; and errors [B] (see `_explained`)."""
-        shown, rival, margin = self.final.within_limits(one, rival, margin, points, dense)
-        shown, _, margin, votes, error = self.other_views.sought(shown, rival, margin, votes, points, dense)
-        error = error if self.other_views.every_way else self.final.distance(one, points)
-        return self._packaged(shown, points, margin, votes, dense), error
 
     def _packaged(
         self,

@@ -155,15 +155,10 @@ class SlidingSearch(WithSurface):
     def turns(
         self,
         clouds: Tensor,  # [B, N, 3] with all their points, on the CPU
-        decides: bool = True,
     ) -> tuple[Tensor, Tensor]:  # [B, 2, 3, 3], [B]
-        """Rotations cloud -> canonical orientation, the likeliest two, and how much likelier the first is.
-
-        Args:
-            decides: The network has a say, if there is one.
-        """
+        """Rotations cloud -> canonical orientation, the likeliest two, and how much likelier the first is."""
         turn, cost = self.leading_turns(clouds)
-        if not decides or self.surface is None:
+        if self.surface is None:
             return turn[:, :_TURNS], (1 - cost[:, 0] / cost[:, 1]).clamp(0, 1)
         turn, odds = self._looked_at(turn, clouds)
         margin = ((odds[:, 0] - odds[:, 1]) / (2 * self.surface.temperature.cpu())).tanh()
@@ -207,11 +202,10 @@ class SlidingSearch(WithSurface):
         self,
         chain: KinematicChain,
         clouds: Tensor,  # [B, N, 3] with all their points
-        decides: bool = True,
     ) -> Slid:
         """The shape in every cloud, in each of two turns, the likelier first (`turns`)."""
         device, clouds = clouds.device, clouds.cpu().clone()  # no inference tensor
-        turn, margin = self.turns(clouds, decides)
+        turn, margin = self.turns(clouds)
         copies = torch.einsum("bcij,bnj->bcni", turn, clouds).flatten(0, 1)
         said = None if self.parts is None else self._said(clouds, turn).flatten(0, 1)
         fit, share = self._fitted(self._shape(chain), copies, said)

@@ -76,6 +76,16 @@ def test_search_stays_within_the_orientation_range(trained):
     assert module.orientation.contains(rotation).all()
 
 
+def test_only_the_network_of_the_paper_is_left_out(monkeypatch):
+    """What is searched for it is sought among the turns of the cube, and on the other side, as ever."""
+    estimator, asked = tiny_module().estimator, []
+    for search in (estimator.square_search, estimator.other_views):
+        monkeypatch.setattr(search, "sought", lambda *of, sought=search.sought: (asked.append(1), sought(*of))[1])
+    monkeypatch.setattr(estimator, "align", lambda _: pytest.fail("the network is asked"))
+    estimator.search(torch.rand(3, 48, 3, generator=torch.Generator().manual_seed(1)) - 0.5)
+    assert len(asked) == 2
+
+
 def test_a_set_without_labels_is_refused(trained, tmp_path):
     without_labels(write_synthetic_set(tmp_path))
     with pytest.raises(ValueError, match="no labels"):

@@ -126,13 +126,14 @@ def test_what_has_no_rival_keeps_its_margin(module, clouds, monkeypatch):
     assert (found.margin == 0.7).all()
 
 
-def test_no_network_has_a_say_in_the_search_without_one(module, clouds):
+def test_what_was_taught_has_a_say_in_the_search_without_the_network(module, clouds):
     module.states.limits.copy_(torch.tensor([[-1.0, 1.0]]))
     taught(module, 50.0)
-    before = module.estimator.search(clouds[:, :POINTS], clouds)
-    module.two_ways.surface = Preference(1e3)
-    after = module.estimator.search(clouds[:, :POINTS], clouds)
-    torch.testing.assert_close(after.base_pose, before.base_pose, atol=0, rtol=0)
+    found = []
+    for preference in (1e3, -1e3):
+        module.two_ways.surface = Preference(preference)
+        found.append(module.estimator.search(clouds[:, :POINTS], clouds).base_pose)
+    assert ((found[0] - found[1]).abs().amax(dim=(1, 2)) > 1e-3).all()
 
 
 def test_what_relief_says_teaches_exchanged_parts_too(module, clouds, monkeypatch):
@@ -205,7 +206,7 @@ def test_unregistered_predictions_have_a_twin_that_follows_from_them(module, clo
     assert (related[0] | related[1]).all()
 
 
-def test_a_search_without_a_network_is_decided_alike(module, clouds):
+def test_a_search_without_the_network_is_decided_alike(module, clouds):
     module.states.limits.copy_(torch.tensor([[-1.0, 1.0]]))
     taught(module, 50.0)
     longer = module.estimator.search(clouds[:, :POINTS], clouds)
