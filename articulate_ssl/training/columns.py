@@ -6,7 +6,7 @@
     network              the network, nothing registered after it
     network_registered   the network, its predicted shapes registered to the cloud
 
-Where clouds can be explained in two ways, the decision that was learnt (`inference.two_ways`) takes part in all three.
+Whatever was learnt after training, decisions, looks, poses, takes part in all three: only the network of the paper does not.
 Each is calibrated on its own predictions of the same training clouds, and scored on the same test clouds.
 """
 
