@@ -6,7 +6,7 @@
     network              the network, nothing registered after it
     network_registered   the network, its predicted shapes registered to the cloud
 
-What is learnt after training, decisions, looks, parts, takes part in all three: the first lacks the paper's network alone.
+What is learnt after training, decisions, looks, parts, takes part in all three: the first lacks the paper's network.
 Each is calibrated on its own predictions of the same training clouds, and scored on the same test clouds.
 """
 
