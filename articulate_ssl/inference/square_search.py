@@ -9,8 +9,9 @@ each of these rotations and from joint states up to that of a closed door. Where
 than the explanation, where this has a state that training did not show, or hardly fits better than its rival, the few
 that fit best take the cloud's own proportions, without which fits do not tell, and the nearest explanation wins.
 
-Of boxes that are closed even the nearest is often wrong, as a box is one any way round. What they look like says more
-(`box_turns`), if that was taught: only what looks right is tried, likeliest first, and what looks wrong gives way.
+Of boxes that are closed even the nearest is often wrong, as a box is one any way round; and of open ones some fit a
+closed box as well, but for the door that hangs out of it. What they look like says more (`box_turns`), if that was
+taught: only what looks right is tried, likeliest first, and how likely that is counts together with how near it is.
 
 Views show too little of a box for that, and plates say nothing about which of them is which.
 """
@@ -94,16 +95,17 @@ class _Squares(NamedTuple):
         states: StateRange,
     ) -> _Squares:
         """Those that look right, likeliest first. How right they look counts as fits do."""
-        rotation = one.base[..., :3, :3]
         most, anyhow, likely = looks.of(self.base[..., :3, :3])
-        as_most, _, own = (value[:, 0] for value in looks.of(rotation))
+        as_most, _, own = (value[:, 0] for value in looks.of(one.base[..., :3, :3]))
         # Registration may leave a closed door open: what is hinged as most are is tried with it closed, too.
         closed = states.rest.to(self.state).expand_as(self.state)
         base, state = torch.cat([self.base] * 2, dim=1), torch.cat([self.state, closed], dim=1)
         right, stands = anyhow > -DECIDED, most > -DECIDED
         allowed = torch.cat([right & (stands | states.showed(self.state, _REGISTERED)), right & stands], dim=1)
         shown, likely = torch.cat([~stands] * 2, dim=1), torch.cat([likely] * 2, dim=1)
-        order = likely.masked_fill(~allowed, -torch.inf)
+        # What is hinged elsewhere comes after all that is not.
+        order = torch.where(shown, -2 * DECIDED, 0.0) + torch.cat([anyhow] * 2, dim=1)
+        order = order.masked_fill(~allowed, -torch.inf)
         order = order.argsort(dim=1, descending=True, stable=True)
         rows = torch.arange(len(order), device=order.device)[:, None]
         asked = torch.where(looks.decided, ~states.showed(one.state[:, 0]), self.asked) | (as_most <= -DECIDED)
