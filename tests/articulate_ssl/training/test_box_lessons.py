@@ -93,7 +93,7 @@ def test_a_network_learns_which_way_round_boxes_with_closed_doors_are(monkeypatc
     assert turns.learnt and module.estimator.square_search.measured
     found, closed, _ = _boxes(40, opened=0.0)
     frames, _ = manhattan_frames(closed, torch.Generator().manual_seed(0))
-    rotation, likely, _ = turns.looks(closed, frames, torch.eye(3)[None])
+    rotation, likely, *_ = turns.looks(closed, frames, torch.eye(3)[None])
     rotation = rotation[torch.arange(len(closed)), likely.argmax(dim=1)]
     right = (rotation * found.base_pose[:, :3, :3]).sum(dim=(1, 2)) > 2.8
     assert right.double().mean() > 0.9 and right[likely.amax(dim=1).exp() > 0.9].double().mean() > 0.95
