@@ -11,7 +11,8 @@ that fit best take the cloud's own proportions, without which fits do not tell, 
 
 Of boxes that are closed even the nearest is often wrong, as a box is one any way round; and of open ones some fit a
 closed box as well, but for the door that hangs out of it. What they look like says more (`box_turns`), if that was
-taught: only what looks right is tried, likeliest first, and how likely that is counts together with how near it is.
+taught: only what looks right is tried, likeliest first, and how likely that is counts together with how near it is,
+and with whether its door stands as training showed.
 
 Views show too little of a box for that, and plates say nothing about which of them is which.
 """
@@ -49,16 +50,10 @@ _REGISTERED = 0.15
 _AT_ONCE = 4  # clouds whose explanations take proportions: on a CPU, of one alone that takes three times as long
 # Logarithm of how much likelier something is, by that of how much better it fits; 10 and 15 decide alike.
 _FITS = 12.0
+# By how much likelier, as a logarithm, a door stands as training showed it; 1.5 and 3 decide alike.
+_UNSEEN = 2.0
 # Of its largest extent the smallest of a box at least (bodies of the package: .66 to .83, plates: .07 and .09).
 _THICK = 0.25
-
-
-def _as_it_looks(
-    error: Tensor,  # [b]
-    looks: Tensor,  # [b] logarithms
-) -> Tensor:  # [b]
-    """Errors, as much larger as what has them looks less right."""
-    return error * (-looks / _FITS).exp()
 
 
 class _Squares(NamedTuple):
@@ -194,7 +189,7 @@ class SquareSearch:
         asked = squares.asked.nonzero()[:, 0]
         for rows in asked.split(_AT_ONCE) if len(asked) else ():
             own, some, start = points[rows], squares.rows(rows), one.rows(rows)
-            error = _as_it_looks(self.final.distance(start, own), some.own)
+            error = self._as_likely(self.final.distance(start, own), some.own, start)
             contest = Contest(start, rival.rows(rows), margin[rows], error, self._as_rival)
             for which, tried, error, allowed in self._fits(some, own, dense[rows]):
                 tried = contest.one.with_rows(which, tried)
@@ -218,12 +213,24 @@ class SquareSearch:
             return
         tried = final.articulated.category_at(squares.base[cloud, rank, None], squares.state[cloud, rank, None])
         tried = final.in_proportion(tried, points[cloud], dense[cloud])
-        error = _as_it_looks(final.distance(tried, points[cloud]), squares.looks[cloud, rank])
+        error = self._as_likely(final.distance(tried, points[cloud]), squares.looks[cloud, rank], tried)
         state = tried.state[:, 0]
         allowed = states.contains(state) & (~squares.shown[cloud, rank] | states.showed(state))
         for k in range(int(rank.max()) + 1):
             some = (rank == k).nonzero()[:, 0]
             yield cloud[some], tried.rows(some), error[some], allowed[some]
+
+    def _as_likely(
+        self,
+        error: Tensor,  # [b]
+        looks: Tensor,  # [b] logarithms
+        of: Hypotheses,  # H = 1
+    ) -> Tensor:  # [b]
+        """Errors, as much larger as what has them is less likely, where looks say that."""
+        if not self.turns.learnt:
+            return error
+        shown = self.final.registration.states.showed(of.state[:, 0])
+        return error * ((torch.where(shown, 0.0, _UNSEEN) - looks) / _FITS).exp()
 
     def _hinges(self) -> tuple[Tensor, Tensor]:  # [W, 3, 3], [W]
         """Turns about a door's normal, of hinges that are elsewhere than most, and logarithms of how many are so.
