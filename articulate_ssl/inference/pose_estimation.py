@@ -30,6 +30,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -75,6 +76,22 @@ from articulate_ssl.shape.observation import Observation
 # Of the width of a joint's range: registration, before proportions, leaves doors 10 degrees off and more. Chosen.
 _WELL_BEYOND = 0.15
 _RARE = 1.1  # by which errors of what is hinged elsewhere than most count more (docs/experiments.md, step 153). Chosen.
+
+
+class _How(NamedTuple):
+    """How a prediction is made.
+
+    Attributes:
+        num_points: The networks read this many leading points; None: the network of the paper is left out (`search`).
+        registers: What is proposed is registered.
+        fits: It takes the clouds' proportions, or poses as a network says.
+        rivals: They are told, too.
+    """
+
+    num_points: int | None
+    registers: bool
+    fits: bool = True
+    rivals: bool = False
 
 
 class PoseEstimator(Proposals):
@@ -142,6 +159,10 @@ class PoseEstimator(Proposals):
         self.other_views = OtherViews(self.final, self.hinge_sides.camera, self.closed_views, self.box_turns)
         self.square_search = SquareSearch(self.final, self.hinge_sides, self.box_turns)
 
+    def _registers(self, refine: bool | None) -> bool:
+        """What the options say, unless it is said."""
+        return (self.inference.refine if refine is None else refine) is not False
+
     @property
     def reads_dense(self) -> bool:
         """Whether what is decided or measured in the end reads all points of a cloud."""
@@ -169,7 +190,7 @@ class PoseEstimator(Proposals):
         Raises:
             ValueError: if a cloud has NaN or infinite points.
         """
-        return self._predicted(points, num_points, refine, dense, fits=True, rivals=False)[0]
+        return self._predicted(points, dense, _How(num_points, self._registers(refine)))[0]
 
     @torch.no_grad()
     def predict_with_rivals(
@@ -188,7 +209,7 @@ class PoseEstimator(Proposals):
         Raises:
             ValueError: if a cloud has NaN or infinite points.
         """
-        return self._predicted(points, num_points, refine, dense, fits, rivals=True)
+        return self._predicted(points, dense, _How(num_points, self._registers(refine), fits, rivals=True))
 
     @torch.no_grad()
     def search(
@@ -205,48 +226,30 @@ class PoseEstimator(Proposals):
         Raises:
             ValueError: if a cloud has NaN or infinite points.
         """
-        return self._predicted(points, None, True, dense, fits=True, rivals=False)[0]
+        return self._predicted(points, dense, _How(None, registers=True))[0]
 
-    def _predicted(
-        self,
-        points: Tensor,
-        num_points: int | None,
-        refine: bool | None,
-        dense: Tensor | None,
-        fits: bool,
-        rivals: bool,
-    ) -> tuple[Prediction, Prediction]:
-        """See `predict_with_rivals`; without `rivals` the second is of no use. Without `num_points` see `search`."""
+    def _predicted(self, points: Tensor, dense: Tensor | None, how: _How) -> tuple[Prediction, Prediction]:
+        """See `predict_with_rivals` and `search`; without `rivals` the second prediction is of no use."""
         if not torch.isfinite(points).all():
             raise ValueError("a cloud has NaN or infinite points")
-        found, rival = self._decided(points, num_points, refine, dense, fits, rivals)
-        registers = (self.inference.refine if refine is None else refine) is not False
+        found, rival = self._decided(points, dense, how)
         # Similar views say parts, too, and better than posed shapes; whether better than this network was not asked.
-        if not fits or dense is None or not self.pose_network.learnt or (registers and self.view_search.learnt):
+        if not how.fits or dense is None or not self.pose_network.learnt or (how.registers and self.view_search.learnt):
             return found, rival
-        says = self.pose_network.labelled if registers else self.pose_network.posed
+        says = self.pose_network.labelled if how.registers else self.pose_network.posed
         with torch.autocast(points.device.type, enabled=False):
             return says(found, points, dense), rival
 
-    def _decided(
-        self,
-        points: Tensor,
-        num_points: int | None,
-        refine: bool | None,
-        dense: Tensor | None,
-        fits: bool,
-        rivals: bool,
-    ) -> tuple[Prediction, Prediction]:
+    def _decided(self, points: Tensor, dense: Tensor | None, how: _How) -> tuple[Prediction, Prediction]:
         """See `_predicted`: before a network says poses."""
         count, hands = len(points), self.handedness.hands
         shown = None if dense is None else hands(dense)
-        *every, error = self._explained(hands(points), num_points, refine, shown, fits, rivals)
+        *every, error = self._explained(hands(points), shown, how)
         seen = [one[:count] for one in every]
         if self.hinge_sides.learnt:
             seen = [self.hinge_sides.counted_from_closed(one) for one in seen]
             seen[0], quarters = self.hinge_sides.decided(seen[0], dense)
-            registers = (self.inference.refine if refine is None else refine) is not False
-            if fits and registers and not self.other_views.lie:
+            if how.fits and how.registers and not self.other_views.lie:
                 seen[0] = self._as_most_are(seen[0], quarters, points, dense)
         if not self.handedness.learnt:
             return tuple(seen)
@@ -260,29 +263,21 @@ class PoseEstimator(Proposals):
         num_points: int,
     ) -> tuple[Tensor, Tensor]:  # [B], [B]
         """Errors of predictions, and of those of the clouds' mirror images, from which `handedness` learns."""
-        return self._explained(both_hands(points), num_points, None, None, False, False)[2].chunk(2)
+        how = _How(num_points, self._registers(None), fits=False)
+        return self._explained(both_hands(points), None, how)[2].chunk(2)
 
-    def _explained(
-        self,
-        points: Tensor,
-        num_points: int | None,
-        refine: bool | None,
-        dense: Tensor | None,
-        fits: bool,
-        rivals: bool,
-    ) -> tuple[Prediction, Prediction, Tensor]:
+    def _explained(self, points: Tensor, dense: Tensor | None, how: _How) -> tuple[Prediction, Prediction, Tensor]:
         """See `_predicted`: by the category's own hand; and errors [B], by which hands are told apart.
 
         These are the errors before proportions, as proportions make up for the wrong hand; but of doors that may be
         closed those by which ways are told apart, as the explanation before is one of open doors.
         """
         with torch.autocast(points.device.type, enabled=False):
-            registers = (self.inference.refine if refine is None else refine) is not False
             self.square_search.measure()
             self.other_views.measure()
-            chosen, other, margin, votes = self._chosen(points, num_points, registers, dense)
+            chosen, other, margin, votes = self._chosen(points, how.num_points, how.registers, dense)
             before = None
-            if registers and fits:
+            if how.registers and how.fits:
                 before = self.final.distance(chosen, points)
                 chosen, other, margin = self.final.within_limits(chosen, other, margin, points, dense)
                 chosen, other, margin = self.square_search.sought(chosen, other, margin, points, dense)
@@ -293,9 +288,9 @@ class PoseEstimator(Proposals):
                     turn = (chosen.base[:, 0, :3, :3] @ self.object_frame.axes).mT
                     votes = self.view_search.parts.beside(votes, dense, turn)
             found = self._packaged(chosen, points, margin, votes, dense)
-            rival = self._packaged(other, points, torch.zeros_like(margin)) if rivals else found
+            rival = self._packaged(other, points, torch.zeros_like(margin)) if how.rivals else found
             square = self.object_frame.learnt and self.front_ends.learnt
-            if registers and fits and square and dense is not None:
+            if how.registers and how.fits and square and dense is not None:
                 category = self.articulated.category.articulated_shape(self.articulated.joint_type)
                 chosen = self.front_ends.placed(chosen, self.object_frame, category, dense, found.dense_part_id)
                 found = self._packaged(chosen, points, margin, votes, dense)

@@ -157,8 +157,8 @@ def test_what_looks_right_counts_as_what_fits_does(search, data, monkeypatch, er
         better, worse = worse, better
     assert torch.equal(one.base[:2, 0], better[:2]) and torch.equal(one.base[2:], said.base[2:])
     assert torch.equal(rival.base[:2, 0], worse[:2])
-    sides = 1 - math.exp(7 / 12) / error if kept else math.tanh(4.5)
-    torch.testing.assert_close(margin, torch.tensor([sides] * 2 + [0.9] * 2), atol=1e-3, rtol=0)
+    left = 1 - math.exp(7 / 12) / error if kept else math.tanh(4.5)
+    torch.testing.assert_close(margin, torch.tensor([left] * 2 + [0.9] * 2), atol=1e-3, rtol=0)
     closed = _at(search, wrong, data.state)
     one, _, _ = search.sought(closed, closed, sure, data.points, data.points)
     assert torch.equal(one.base[:2, 0], better[:2])

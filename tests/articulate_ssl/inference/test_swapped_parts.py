@@ -116,15 +116,11 @@ class Near(SurfaceDecision):
 
 @pytest.mark.parametrize("searched", [False, True])
 def test_what_is_seen_from_near_decides(module, clouds, searched):
-    points, found = clouds[:, :POINTS], {}
+    estimator, points, found = module.estimator, clouds[:, :POINTS], {}
     module.states.limits.copy_(torch.tensor([[-1.0, 1.0]]))
     for sign in (1.0, -1.0):
         module.two_ways.near = Near(sign)
-        said = (
-            module.estimator.search(points, clouds)
-            if searched
-            else module.estimator.predict(points, POINTS, True, clouds)
-        )
+        said = estimator.search(points, clouds) if searched else estimator.predict(points, POINTS, True, clouds)
         found[sign] = said.base_pose[:, :3, :3]
     assert (roma.rotmat_geodesic_distance(found[1.0], found[-1.0]) > 0.1).any()
 
