@@ -114,12 +114,14 @@ class Candidates:
         base: [B, C, 4, 4] base poses.
         state: [B, C, J] joint states.
         select: One of each cloud, by its index [B], as H = 1.
+        said: [B, 3, 3] how the network alone turns objects, before anything is registered; None: it was not asked.
     """
 
     error: Tensor
     base: Tensor
     state: Tensor
     select: Callable[[Tensor], Hypotheses]
+    said: Tensor | None = None
 
 
 def better(

@@ -94,6 +94,24 @@ class _How(NamedTuple):
     rivals: bool = False
 
 
+class _Chosen(NamedTuple):
+    """What is decided for, before it takes clouds' proportions.
+
+    Attributes:
+        one: H = 1.
+        rival: H = 1, the best that is turned another way.
+        margin: [B] between them (`Prediction.margin`).
+        votes: Which parts of points other clouds or views say, if there are any.
+        said: [B, 3, 3] see `Candidates.said`.
+    """
+
+    one: Hypotheses
+    rival: Hypotheses
+    margin: Tensor
+    votes: Votes | None = None
+    said: Tensor | None = None
+
+
 class PoseEstimator(Proposals):
     """Pose estimation with the networks of a module, which owns them, trains them and saves them.
 
@@ -275,12 +293,12 @@ class PoseEstimator(Proposals):
         with torch.autocast(points.device.type, enabled=False):
             self.square_search.measure()
             self.other_views.measure()
-            chosen, other, margin, votes = self._chosen(points, how.num_points, how.registers, dense)
+            chosen, other, margin, votes, said = self._chosen(points, how.num_points, how.registers, dense)
             before = None
             if how.registers and how.fits:
                 before = self.final.distance(chosen, points)
                 chosen, other, margin = self.final.within_limits(chosen, other, margin, points, dense)
-                chosen, other, margin = self.square_search.sought(chosen, other, margin, points, dense)
+                chosen, other, margin = self.square_search.sought(chosen, other, margin, points, dense, said)
                 sought = self.other_views.sought(chosen, other, margin, votes, points, dense)
                 chosen, other, margin, votes, error = sought
                 before = error if self.other_views.every_way else before
@@ -330,24 +348,23 @@ class PoseEstimator(Proposals):
     ) -> Hypotheses:  # H = 1
         """What is decided for, registered, before it takes clouds' proportions: from which `part_frames` learn."""
         with torch.autocast(points.device.type, enabled=False):
-            return self._chosen(points, num_points, True, dense)[0]
+            return self._chosen(points, num_points, True, dense).one
 
-    def _chosen(
-        self, points: Tensor, num_points: int | None, registers: bool, dense: Tensor | None
-    ) -> tuple[Hypotheses, Hypotheses, Tensor, Votes | None]:  # H = 1, H = 1, [B]
-        """What is decided for, its rival, the margin between them, and parts of points as labelled clouds vote."""
-        votes = None
+    def _chosen(self, points: Tensor, num_points: int | None, registers: bool, dense: Tensor | None) -> _Chosen:
+        """See `_Chosen`."""
         if registers and self.view_search.learnt:
-            chosen, other, margin, votes = self._seen(points, dense, num_points)
+            chosen = self._seen(points, dense, num_points)
         elif registers and dense is not None and self.sliding.learnt:
-            chosen, other, margin, votes = self._slid(points, dense, num_points)
+            chosen = self._slid(points, dense, num_points)
         else:
-            chosen, other, margin = self._best(self._candidates(points, num_points, registers))
+            candidates = self._candidates(points, num_points, registers)
+            chosen = _Chosen(*self._best(candidates), said=candidates.said)
+        one, rival, margin = chosen[:3]
         if dense is not None and self.two_ways.learnt:
-            chosen, other, margin = self.decision.by_relief(chosen, points, dense, registers)
+            one, rival, margin = self.decision.by_relief(one, points, dense, registers)
         elif dense is not None and self.two_ways.surface is not None:
-            chosen, other, margin = self.decision.by_surface(chosen, other, margin, points, dense, registers)
-        return chosen, other, margin, votes
+            one, rival, margin = self.decision.by_surface(one, rival, margin, points, dense, registers)
+        return chosen._replace(one=one, rival=rival, margin=margin)
 
     def _best(self, candidates: Candidates) -> tuple[Hypotheses, Hypotheses, Tensor]:
         """The best candidate of every cloud, its rival, and the margin between them [B].
@@ -395,24 +412,23 @@ class PoseEstimator(Proposals):
             *_, last = self.iterate(aligned)
             turn = None if turn is None else pose[:, :3, :3].mT @ turn
             candidates, error = self.registration.leading(last, transform_points(invert_se3(pose), points), turn)
+            said = (pose @ last.hypotheses.select(last.winner).base[:, 0])[:, :3, :3]
         else:
             candidates, error, pose = self.proposed(points[:, :num_points])
+            said = None
         candidates = candidates.at(pose[:, None] @ candidates.base, candidates.state)
-        return Candidates(error, candidates.base, candidates.state, candidates.select)
+        return Candidates(error, candidates.base, candidates.state, candidates.select, said)
 
     def _slid(
         self,
         points: Tensor,  # [B, N, 3]
         dense: Tensor,  # [B, P, 3]
         num_points: int | None,
-    ) -> tuple[Hypotheses, Hypotheses, Tensor, Votes | None]:  # H = 1, H = 1, [B]
+    ) -> _Chosen:
         """The category's shape where the search for sliding parts finds it, and its rival.
 
         Which way round clouds are, the search decides; with `num_points` the network's hypotheses that are turned alike
-        compete by their errors.
-
-        Returns:
-            Both, the margin between them, and which parts labelled clouds say that points are of, if there are any.
+        compete by their errors. Which parts points are of, labelled clouds vote, if there are any.
         """
         shape, base, state, margin, votes = self.sliding.search(self.articulated.category.chain(), dense)
         clouds, count = base.shape[:2]
@@ -428,24 +444,22 @@ class PoseEstimator(Proposals):
 
         first, rival = select(torch.zeros_like(rows)), select(torch.ones_like(rows))
         if num_points is None:
-            return first, rival, margin, votes
+            return _Chosen(first, rival, margin, votes)
         error = chamfer_l1(points, first.posed()[:, 0].flatten(1, 2), self.observation.bidirectional)
         others = self._candidates(points, num_points, registers=True)
-        return better(first, error, others, first.base[:, 0, :3, :3]), rival, margin, votes
+        return _Chosen(better(first, error, others, first.base[:, 0, :3, :3]), rival, margin, votes)
 
     def _seen(
         self,
         points: Tensor,  # [B, N, 3]
         dense: Tensor | None,  # [B, P, 3]
         num_points: int | None,
-    ) -> tuple[Hypotheses, Hypotheses, Tensor, Votes]:  # H = 1, H = 1, [B]
+    ) -> _Chosen:
         """The category's shape, registered from where the search among simulated views finds it, and its rival.
 
         Which way round objects are, the search decides, or a network, if that was taught; with `num_points` the
-        articulated network's hypotheses that are turned alike compete by their errors.
-
-        Returns:
-            Both, the margin between them, and which parts the views say that points are of.
+        articulated network's hypotheses that are turned alike compete by their errors. Which parts points are of, the
+        views vote.
         """
         seen = self.view_search.search(points)
         if dense is not None and self.object_frame.surface is not None:
@@ -458,10 +472,10 @@ class PoseEstimator(Proposals):
         likelier, rival = (self.articulated.category_at(base[:, i, None], state[:, i, None]) for i in range(2))
         first, error = self.registration.registered(likelier, points)
         if num_points is None:
-            return first, rival, margin, votes
+            return _Chosen(first, rival, margin, votes)
         turn = base[:, 0, :3, :3]
         chosen = better(first, error[:, 0], self._candidates(points, num_points, True, turn), turn)
-        return chosen, rival, margin, votes
+        return _Chosen(chosen, rival, margin, votes)
 
     def _packaged(
         self,

@@ -52,6 +52,8 @@ _AT_ONCE = 4  # clouds whose explanations take proportions: on a CPU, of one alo
 _FITS = 12.0
 # By how much likelier, as a logarithm, a door stands as training showed it; 1.5 and 3 decide alike.
 _UNSEEN = 2.0
+# By how much likelier, as a logarithm, objects are turned as the network alone says; .5 and 1.5 decide alike.
+_SAID = 1.0
 # Of its largest extent the smallest of a box at least (bodies of the package: .66 to .83, plates: .07 and .09).
 _THICK = 0.25
 
@@ -64,7 +66,7 @@ class _Squares(NamedTuple):
         state: [B, C, 1]
         allowed: [B, C] bool, which are tried.
         shown: [B, C] bool, which only count in joint states that training showed.
-        looks: [B, C] how likely they are by their looks, a logarithm (`Looks.of`).
+        looks: [B, C] how likely they are by their looks, and by what the network alone says, a logarithm.
         own: [B] the same of what is decided for.
         asked: [B] bool, whether any are tried.
         least: [B] share of the error of what is decided for, that another has to be below to take its place.
@@ -88,8 +90,9 @@ class _Squares(NamedTuple):
         one: Hypotheses,  # H = 1, what is decided for
         looks: Looks,
         states: StateRange,
+        said: Tensor | None,  # [B, 3, 3]
     ) -> _Squares:
-        """Those that look right, likeliest first. How right they look counts as fits do."""
+        """Those that look right, likeliest first. How right they look counts as fits do, and so does what was said."""
         most, anyhow, likely = looks.of(self.base[..., :3, :3])
         as_most, _, own = (value[:, 0] for value in looks.of(one.base[..., :3, :3]))
         # Registration may leave a closed door open: what is hinged as most are is tried with it closed, too.
@@ -104,6 +107,9 @@ class _Squares(NamedTuple):
         order = order.argsort(dim=1, descending=True, stable=True)
         rows = torch.arange(len(order), device=order.device)[:, None]
         asked = torch.where(looks.decided, ~states.showed(one.state[:, 0]), self.asked) | (as_most <= -DECIDED)
+        if said is not None:
+            likely, own = likely + _as_said(base, said), own + _as_said(one.base, said)[:, 0]
+            asked |= angle_to(one.base[..., :3, :3], said)[:, 0] > ANOTHER_WAY
         ordered = (value[rows, order] for value in (base, state, allowed, shown, likely))
         return _Squares(*ordered, own, asked, torch.ones_like(self.least))
 
@@ -146,8 +152,13 @@ class SquareSearch:
         margin: Tensor,  # [B]
         points: Tensor,  # [B, N, 3]
         dense: Tensor | None,  # [B, P, 3]
+        said: Tensor | None = None,  # [B, 3, 3]
     ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
-        """Explanations, or those square to the clouds' faces that fit better, or look right."""
+        """Explanations, or those square to the clouds' faces that fit better, or look right.
+
+        Args:
+            said: How the network alone turns objects (`Candidates.said`), if it was asked.
+        """
         if not self.known or dense is None:
             return one, rival, margin
         frames, _ = manhattan_frames(dense, torch.Generator().manual_seed(0))  # of clouds
@@ -155,7 +166,7 @@ class SquareSearch:
         if not self.turns.learnt:
             return self._tried(squares, one, rival, margin, points, dense)
         looks = self.turns.looks(dense, frames, *self._hinges())
-        squares = squares.looking_right(one, looks, self.final.registration.states)
+        squares = squares.looking_right(one, looks, self.final.registration.states, said)
         one, rival, margin = self._tried(squares, one, rival, margin, points, dense)
         confirmed = looks.decided & (looks.of(one.base[..., :3, :3])[1][:, 0] > -DECIDED)
         sure = 2 * looks.likely.amax(dim=1).exp() - 1
@@ -288,3 +299,11 @@ class SquareSearch:
         base = se3(frames.mT, torch.zeros_like(middle))[:, None] @ se3(base[..., :3, :3], shift)
         order = error.argsort(dim=1)
         return base[cloud, order], state[cloud, order]
+
+
+def _as_said(
+    base: Tensor,  # [B, C, 4, 4]
+    said: Tensor,  # [B, 3, 3]
+) -> Tensor:  # [B, C]
+    """How much likelier than others what is turned as was said is, a logarithm."""
+    return torch.where(angle_to(base[..., :3, :3], said) < ANOTHER_WAY, _SAID, 0.0)

@@ -178,6 +178,23 @@ def test_what_looks_right_as_training_showed_it_is_taken_as_it_is(search, data, 
     torch.testing.assert_close(margin, torch.tensor([math.tanh(1.5)] * 2 + [0.95, 1.0]), atol=1e-6, rtol=0)
 
 
+@pytest.mark.parametrize("error", [1.05, 1.15])
+def test_what_the_network_alone_says_counts_as_well(search, data, monkeypatch, error):
+    """By e^(1/12), or 1.09. Where it turns objects another way, what looks undecided is doubted."""
+    search.measure()
+    wrong, state = _turned(data)
+    _looking_right(search, monkeypatch, data, [0.0] * 4)
+    _fitting(search, monkeypatch, data, error)
+    monkeypatch.setattr(search, "_square", lambda *_: (data.base[:, None], state[:, None]))
+    one, sure = _at(search, wrong, state), torch.full((4,), 0.9)
+    sought = [
+        search.sought(one, one, sure, data.points, data.points, said)[0].base[:, 0]
+        for said in (data.base[:, :3, :3], wrong[:, :3, :3], None)
+    ]
+    assert torch.equal(sought[0], data.base if error < math.exp(1 / 12) else wrong)
+    assert torch.equal(sought[1], wrong) and torch.equal(sought[2], wrong)
+
+
 @pytest.mark.parametrize(
     "learnt, elsewhere, opened",
     [(True, 0.8, 1), (True, 0.9, 1), (True, 1.1, 1), (False, 0.8, 1), (True, 0.8, 0)],
