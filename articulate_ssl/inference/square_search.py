@@ -12,7 +12,7 @@ that fit best take the cloud's own proportions, without which fits do not tell, 
 Of boxes that are closed even the nearest is often wrong, as a box is one any way round; and of open ones some fit a
 closed box as well, but for the door that hangs out of it. What they look like says more (`box_turns`), if that was
 taught: only what looks right is tried, likeliest first, and how likely that is counts together with how near it is,
-and with whether its door stands as training showed.
+with whether its door stands as training showed, and with what the network alone says.
 
 Views show too little of a box for that, and plates say nothing about which of them is which.
 """
