@@ -52,7 +52,7 @@ _AT_ONCE = 4  # clouds whose explanations take proportions: on a CPU, of one alo
 _FITS = 12.0
 # By how much likelier, as a logarithm, a door stands as training showed it; 1.5 and 3 decide alike.
 _UNSEEN = 2.0
-# By how much likelier, as a logarithm, objects are turned as the network alone says; .5 and 1.5 decide alike.
+# By how much likelier, as a logarithm, objects are turned as the network alone says; .5 decides alike, 3 worse.
 _SAID = 1.0
 # Of its largest extent the smallest of a box at least (bodies of the package: .66 to .83, plates: .07 and .09).
 _THICK = 0.25
