@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from articulate_ssl.discovery.manhattan_frame import manhattan_frames
-from articulate_ssl.discovery.sharp_profiles import sharpened
 from articulate_ssl.discovery.synchronization import pairwise_costs, synchronise, unit_boxes
 from articulate_ssl.geometry.rotation_group import rotation_group
 
@@ -28,14 +27,12 @@ def common_frame(
     """Rotations that turn all clouds alike, with their surfaces along the axes; None if they have no such frames.
 
     Args:
-        whole: Whether clouds show all sides, by which frames can be made sharper.
+        whole: Whether clouds show all sides (`manhattan_frames`).
     """
-    rotation, angle = manhattan_frames(clouds, generator)
+    rotation, angle = manhattan_frames(clouds, generator, whole)
     log.info("Manhattan frames: normals %.1f degrees from their axes in the median", angle.median())
     if angle.median() > _LARGEST_ANGLE:
         return None
-    if whole:
-        rotation = sharpened(clouds, rotation, generator)
     group = rotation_group(24)
     boxes, _, _ = unit_boxes(clouds @ rotation.mT)
     element = synchronise(pairwise_costs(boxes, group), group, generator)

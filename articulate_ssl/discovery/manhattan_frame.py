@@ -1,7 +1,8 @@
 """The Manhattan frame of a cloud: three axes at right angles that most of its surface is parallel or square to.
 
-Cabinets, ovens and chests have one. It is found on every cloud by itself, from its normals alone, up to the 24
-rotations of the cube; `synchronization` decides between those for a whole collection.
+Cabinets, ovens and chests have one. It is found on every cloud by itself, from its normals, and of whole clouds from
+where points pile up (`sharp_profiles`), up to the 24 rotations of the cube; `synchronization` decides between those for
+a whole collection.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from articulate_ssl.discovery.sharp_profiles import sharp_frame
 from articulate_ssl.ops.neighborhood import nearest_neighbors
 
 _STRIDE = 4  # normals are measured at every fourth point
@@ -55,11 +57,15 @@ def _normals(
 def manhattan_frames(
     clouds: Tensor,  # [n, N, 3] with as many points as there are
     generator: torch.Generator,
+    whole: bool = False,
 ) -> tuple[Tensor, Tensor]:  # [n, 3, 3], [n]
     """Rotations that bring clouds into their frames, and the mean angle (degrees, capped) of normals to their axes.
 
     From random rotations: give every normal to its nearest axis, if one is near enough, and turn the axes to their
     normals; the start that leaves the smallest angle wins. A cloud of few planes has no frame: its angle is the cap.
+
+    Args:
+        whole: Clouds show all sides: frames are those near which points pile up most, and angles of those before.
     """
     normals, weight = surface_normals(clouds)
     quaternion = functional.normalize(torch.randn(_STARTS, 4, generator=generator), dim=-1)
@@ -75,4 +81,7 @@ def manhattan_frames(
     angle = angle.masked_fill(weight.sum(dim=1, keepdim=True) < _FEWEST, CAP)
     best = angle.argmin(dim=1)
     rows = torch.arange(len(clouds), device=clouds.device)
-    return rotation[rows, best], angle[rows, best]
+    found, angle = rotation[rows, best], angle[rows, best]
+    if whole:
+        found = torch.stack([sharp_frame(*one, generator) for one in zip(clouds, found, rotation, strict=True)])
+    return found, angle

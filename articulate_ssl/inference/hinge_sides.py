@@ -101,6 +101,9 @@ class HingeSides(WithSurface):
 
     Of W ways there are `TURNS`, or as it is and upside down where doors are seen.
 
+    Args:
+        whole: Whether clouds show all sides.
+
     Attributes:
         doors: [] whether doors are seen, also in the mirror, and not bodies.
         learnt: [] whether some objects are hinged elsewhere. Then joint states count from `closed`.
@@ -114,8 +117,9 @@ class HingeSides(WithSurface):
         camera: Which way is up, for a camera that is held upright.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, whole: bool = True) -> None:
         super().__init__()
+        self.whole = whole
         self.camera = UprightCamera()
         self.register_buffer("learnt", torch.tensor(False))
         self.register_buffer("doors", torch.tensor(False))
@@ -263,7 +267,7 @@ class HingeSides(WithSurface):
 
     def _boxes(self, base: Tensor, dense: Tensor) -> Tensor:  # [B, 3, 3]
         """Frames of the boxes as they are predicted, each turned to the nearest of the cloud's own axes."""
-        axes = manhattan_frames(dense, torch.Generator().manual_seed(0))[0].mT
+        axes = manhattan_frames(dense, torch.Generator().manual_seed(0), self.whole)[0].mT
         every = axes[:, None] @ rotation_group(24).elements.to(axes)  # the same axes in every order
         said = base[:, :3, :3] @ self.axes.to(axes)
         nearest = (every * said[:, None]).sum(dim=(-2, -1)).argmax(dim=1)

@@ -153,7 +153,7 @@ class PoseEstimator(Proposals):
         self.sliding = SlidingSearch(*articulated.category.template.shape[:2])
         self.view_search = ViewSearch(articulated.num_parts)
         self.handedness = Handedness()
-        self.hinge_sides = HingeSides()
+        self.hinge_sides = HingeSides(observation.bidirectional)
         self.states = StateRange(articulated.num_parts - 1)
         self.part_frames = PartFrames(articulated.num_parts)
         self.common_shape = CommonShape(articulated.num_parts)

@@ -161,7 +161,7 @@ class SquareSearch:
         """
         if not self.known or dense is None:
             return one, rival, margin
-        frames, _ = manhattan_frames(dense, torch.Generator().manual_seed(0))  # of clouds
+        frames, _ = manhattan_frames(dense, torch.Generator().manual_seed(0), whole=True)  # of clouds
         squares = self._squares(one, margin, points, frames)
         if not self.turns.learnt:
             return self._tried(squares, one, rival, margin, points, dense)
