@@ -150,7 +150,7 @@ class PoseEstimator(Proposals):
     ) -> None:
         self.posterior_scale, self.inference = posterior_scale, inference
         self.two_ways = TwoWays(articulated.num_parts, articulated.num_parts * NUM_FEATURES)
-        self.sliding = SlidingSearch(*articulated.category.template.shape[:2])
+        self.sliding = SlidingSearch(*articulated.category.template.shape[:2], observation.bidirectional)
         self.view_search = ViewSearch(articulated.num_parts)
         self.handedness = Handedness()
         self.hinge_sides = HingeSides(observation.bidirectional)

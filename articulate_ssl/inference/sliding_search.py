@@ -79,6 +79,9 @@ class SlidingSearch(WithSurface):
 
     It computes on the CPU, wherever its buffers are, because distance fields do.
 
+    Args:
+        whole: Whether clouds show all sides.
+
     Attributes:
         gallery: [R, P, 3] training clouds in canonical orientation, stretched to boxes of width one; none before
             anything was learnt.
@@ -90,9 +93,9 @@ class SlidingSearch(WithSurface):
         parts: Which part points are of, if that was taught; else labelled clouds say it.
     """
 
-    def __init__(self, num_parts: int, shape_points: int) -> None:
+    def __init__(self, num_parts: int, shape_points: int, whole: bool = True) -> None:
         super().__init__()
-        joints = num_parts - 1
+        joints, self.whole = num_parts - 1, whole
         self.register_module("parts", None)
         self._copies: tuple[Tensor | None, LabelledClouds | None] = None, None  # of the clouds `labelled`
         self.register_buffer("gallery", torch.zeros(0, _GALLERY_POINTS, 3))
@@ -181,7 +184,7 @@ class SlidingSearch(WithSurface):
         clouds: Tensor,  # [B, N, 3] with all their points, on the CPU
     ) -> tuple[Tensor, Tensor]:  # [B, C, 3, 3], [B, C]
         """Rotations cloud -> canonical orientation, the likeliest first, and how far the clouds most alike then are."""
-        rotation, _ = manhattan_frames(clouds, torch.Generator().manual_seed(0))
+        rotation, _ = manhattan_frames(clouds, torch.Generator().manual_seed(0), self.whole)
         boxes, _, _ = unit_boxes(clouds @ rotation.mT)
         group = rotation_group(24).elements.to(clouds)
         gallery = in_other_proportions(self.gallery.cpu(), _PROPORTIONS, torch.Generator().manual_seed(0))
