@@ -83,5 +83,5 @@ def manhattan_frames(
     rows = torch.arange(len(clouds), device=clouds.device)
     found, angle = rotation[rows, best], angle[rows, best]
     if whole:
-        found = torch.stack([sharp_frame(*one, generator) for one in zip(clouds, found, rotation, strict=True)])
+        found = torch.stack([sharp_frame(*one) for one in zip(clouds, found, rotation, strict=True)])
     return found, angle

@@ -45,7 +45,6 @@ def sharp_frame(
     cloud: Tensor,  # [N, 3] an even sample of the surface, and so are its leading points
     rotation: Tensor,  # [3, 3] to its frame, roughly, or to another
     others: Tensor,  # [S, 3, 3] that may be nearer
-    generator: torch.Generator,
 ) -> Tensor:  # [3, 3]
     """The frame along which points pile up most: that, near it, or near the best of others, turned about axes."""
     few = cloud[:_FEW]
@@ -53,7 +52,8 @@ def sharp_frame(
     for _ in range(2):
         turned = _sharpest(few, _about_axes().to(cloud) @ turned, _CELLS[0][0])
     points = cloud[:_POINTS]
-    nearby = [sharpened(points, one, generator) for one in (rotation, turned)]
+    # By the same turns for every cloud: what is found of one does not depend on others.
+    nearby = [sharpened(points, one, torch.Generator().manual_seed(0)) for one in (rotation, turned)]
     return _sharpest(points, torch.stack([rotation, *nearby]), _CELLS[-1][0])
 
 

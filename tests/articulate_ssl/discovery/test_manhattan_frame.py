@@ -66,3 +66,10 @@ def test_a_frame_is_not_made_of_a_few_planes():
 def test_what_has_no_frame_says_so():
     ball = torch.nn.functional.normalize(torch.randn(2, 4096, 3, generator=_generator()), dim=-1)
     assert manhattan_frames(ball, _generator())[1].min() > 4
+
+
+def test_what_is_found_of_a_whole_cloud_does_not_depend_on_others():
+    data = clouds(OVEN, count=3, points=2048, resample=True, seed=2)
+    every, _ = manhattan_frames(data.points, _generator(), whole=True)
+    last, _ = manhattan_frames(data.points[2:], _generator(), whole=True)
+    torch.testing.assert_close(last, every[2:])

@@ -100,7 +100,7 @@ def test_a_network_chooses_among_the_leading_turns_and_says_how_sure_it_is(learn
     torch.testing.assert_close(margin, (2 * (best - said.topk(2).values[:, 1])).tanh())
     found = search.search(CHAIN, data.points).base[:, 0, :3, :3]
     other = learnt.search(CHAIN, data.points).base[:, 0, :3, :3]
-    assert roma.rotmat_geodesic_distance(found, turn[:, 0].mT).max() < 0.1
+    assert roma.rotmat_geodesic_distance(found, turn[:, 0].mT).max() < 0.15
     assert roma.rotmat_geodesic_distance(other, leading[:, 0].mT).max() < 0.1
     # It is kept with the weights.
     search.surface = SurfaceDecision(SurfaceSize(read=128, centers=64))
