@@ -46,7 +46,7 @@ def sharp_frame(
     rotation: Tensor,  # [3, 3] to its frame, roughly, or to another
     others: Tensor,  # [S, 3, 3] that may be nearer
 ) -> Tensor:  # [3, 3]
-    """The frame along which points pile up most: that, near it, or near the best of others, turned about axes."""
+    """Of that frame, the best near it, and the best near one of the others, turned about its axes: the sharpest."""
     few = cloud[:_FEW]
     turned = _sharpest(few, others, _CELLS[0][0])
     for _ in range(2):
