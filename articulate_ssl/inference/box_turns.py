@@ -53,16 +53,18 @@ class Looks(NamedTuple):
     def of(
         self,
         turn: Tensor,  # [B, C, 3, 3] base rotations
-    ) -> tuple[Tensor, Tensor, Tensor]:  # [B, C], [B, C], [B, C]
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # [B, C], [B, C], [B, C], [B, C]
         """How right what is turned so looks, if it is hinged as most are, or anyhow: 0 for what looks likeliest.
 
-        And how likely it is, by that and by how many are hinged so.
+        And how likely it is, by that and by how many are hinged so, and as which of the 24 ways it stands then.
         """
         stands = turn[:, :, None] @ self.hinges.mT  # [B, C, W, 3, 3]
         near = torch.einsum("bcwij,bgij->bcwg", stands, self.rotation).argmax(dim=-1)
         likely = self.likely - self.likely.amax(dim=1, keepdim=True)
         found = likely.gather(1, near.flatten(1)).view(near.shape)
-        return found[..., 0], found.amax(dim=-1), (found + self.log_prior).amax(dim=-1)
+        likely, hinged = (found + self.log_prior).max(dim=-1)
+        stood = near.gather(-1, hinged[..., None]).squeeze(-1)
+        return found[..., 0], found.amax(dim=-1), likely, stood
 
 
 class BoxTurns(WithSurface):

@@ -12,7 +12,8 @@ that fit best take the cloud's own proportions, without which fits do not tell, 
 Of boxes that are closed even the nearest is often wrong, as a box is one any way round; and of open ones some fit a
 closed box as well, but for the door that hangs out of it. What they look like says more (`box_turns`), if that was
 taught: only what looks right is tried, likeliest first, and how likely that is counts together with how near it is,
-with whether its door stands as training showed, and with what the network alone says.
+with whether its door stands as training showed, and with what the network alone says. Where explanations stand alike
+and only differ in where they are hinged, how near they are tells more.
 
 Views show too little of a box for that, and plates say nothing about which of them is which.
 """
@@ -50,6 +51,8 @@ _REGISTERED = 0.15
 _AT_ONCE = 4  # clouds whose explanations take proportions: on a CPU, of one alone that takes three times as long
 # Logarithm of how much likelier something is, by that of how much better it fits; 10 and 15 decide alike.
 _FITS = 12.0
+# The same of explanations that stand alike: only their doors differ; 40 decides alike (step 343).
+_HINGED = 30.0
 # By how much likelier, as a logarithm, a door stands as training showed it; 1.5 and 3 decide alike.
 _UNSEEN = 2.0
 # By how much likelier, as a logarithm, objects are turned as the network alone says; .5 decides alike, 3 worse.
@@ -67,7 +70,9 @@ class _Squares(NamedTuple):
         allowed: [B, C] bool, which are tried.
         shown: [B, C] bool, which only count in joint states that training showed.
         looks: [B, C] how likely they are by their looks, and by what the network alone says, a logarithm.
-        own: [B] the same of what is decided for.
+        stood: [B, C] as which of the 24 ways they stand (`Looks.of`).
+        own: [B] how likely what is decided for is, so.
+        own_stood: [B] as which way it stands.
         asked: [B] bool, whether any are tried.
         least: [B] share of the error of what is decided for, that another has to be below to take its place.
     """
@@ -77,7 +82,9 @@ class _Squares(NamedTuple):
     allowed: Tensor
     shown: Tensor
     looks: Tensor
+    stood: Tensor
     own: Tensor
+    own_stood: Tensor
     asked: Tensor
     least: Tensor
 
@@ -93,14 +100,14 @@ class _Squares(NamedTuple):
         said: Tensor | None,  # [B, 3, 3]
     ) -> _Squares:
         """Those that look right, likeliest first. How right they look counts as fits do, and so does what was said."""
-        most, anyhow, likely = looks.of(self.base[..., :3, :3])
-        as_most, _, own = (value[:, 0] for value in looks.of(one.base[..., :3, :3]))
+        most, anyhow, likely, stood = looks.of(self.base[..., :3, :3])
+        as_most, _, own, own_stood = (value[:, 0] for value in looks.of(one.base[..., :3, :3]))
         # Registration may leave a closed door open: what is hinged as most are is tried with it closed, too.
         closed = states.rest.to(self.state).expand_as(self.state)
         base, state = torch.cat([self.base] * 2, dim=1), torch.cat([self.state, closed], dim=1)
         right, stands = anyhow > -DECIDED, most > -DECIDED
         allowed = torch.cat([right & (stands | states.showed(self.state, _REGISTERED)), right & stands], dim=1)
-        shown, likely = torch.cat([~stands] * 2, dim=1), torch.cat([likely] * 2, dim=1)
+        shown, likely, stood = (torch.cat([value] * 2, dim=1) for value in (~stands, likely, stood))
         # What is hinged elsewhere comes after all that is not.
         order = torch.where(shown, -2 * DECIDED, 0.0) + torch.cat([anyhow] * 2, dim=1)
         order = order.masked_fill(~allowed, -torch.inf)
@@ -110,8 +117,8 @@ class _Squares(NamedTuple):
         if said is not None:
             likely, own = likely + _as_said(base, said), own + _as_said(one.base, said)[:, 0]
             asked |= angle_to(one.base[..., :3, :3], said)[:, 0] > ANOTHER_WAY
-        ordered = (value[rows, order] for value in (base, state, allowed, shown, likely))
-        return _Squares(*ordered, own, asked, torch.ones_like(self.least))
+        ordered = (value[rows, order] for value in (base, state, allowed, shown, likely, stood))
+        return _Squares(*ordered, own, own_stood, asked, torch.ones_like(self.least))
 
 
 class SquareSearch:
@@ -185,7 +192,8 @@ class SquareSearch:
         another = angle_to(one.base[..., :3, :3], base[:, 0, :3, :3])[:, 0] > ANOTHER_WAY
         every, least = torch.ones_like(state[..., 0], dtype=torch.bool), torch.where(showed, CLEARLY, 1.0)
         asked, looks = ~showed | another | (margin < _UNSURE), torch.zeros_like(state[..., 0])
-        return _Squares(base, state, every, ~every, looks, looks[:, 0], asked, least)
+        stood = torch.zeros_like(every, dtype=torch.long)
+        return _Squares(base, state, every, ~every, looks, stood, looks[:, 0], stood[:, 0], asked, least)
 
     def _tried(
         self,
@@ -199,10 +207,10 @@ class SquareSearch:
         """Explanations, or what fits better, once it has the clouds' proportions."""
         asked = squares.asked.nonzero()[:, 0]
         for rows in asked.split(_AT_ONCE) if len(asked) else ():
-            own, some, start = points[rows], squares.rows(rows), one.rows(rows)
-            error = self._as_likely(self.final.distance(start, own), some.own, start)
-            contest = Contest(start, rival.rows(rows), margin[rows], error, self._as_rival)
-            for which, tried, error, allowed in self._fits(some, own, dense[rows]):
+            some, start = squares.rows(rows), one.rows(rows)
+            errors, fits = self._fits(some, start, points[rows], dense[rows])
+            contest = Contest(start, rival.rows(rows), margin[rows], errors, self._as_rival)
+            for which, tried, error, allowed in fits:
                 tried = contest.one.with_rows(which, tried)
                 error = torch.full_like(some.least, torch.inf).index_copy(0, which, error)
                 allowed = torch.zeros_like(some.asked).index_copy(0, which, allowed)
@@ -214,34 +222,42 @@ class SquareSearch:
     def _fits(
         self,
         squares: _Squares,  # of b clouds
+        start: Hypotheses,  # H = 1
         points: Tensor,  # [b, N, 3]
         dense: Tensor,  # [b, P, 3]
-    ) -> Iterator[tuple[Tensor, Hypotheses, Tensor, Tensor]]:  # [n], H = 1, [n], [n] bool
-        """What is tried, in proportion, what comes first before: of which clouds, its error, and whether it may win."""
+    ) -> tuple[Tensor, Iterator[tuple[Tensor, Hypotheses, Tensor, Tensor]]]:  # [b], of [n], H = 1, [n], [n] bool
+        """Errors of what was decided for; and what is tried, in proportion, what comes first before.
+
+        Returns:
+            Errors; of which clouds that is which is tried, its error, and whether it may win.
+        """
         final, states = self.final, self.final.registration.states
         cloud, rank = squares.allowed[:, :_TRIED].nonzero().unbind(dim=1)
-        if not len(cloud):
-            return
         tried = final.articulated.category_at(squares.base[cloud, rank, None], squares.state[cloud, rank, None])
-        tried = final.in_proportion(tried, points[cloud], dense[cloud])
-        error = self._as_likely(final.distance(tried, points[cloud]), squares.looks[cloud, rank], tried)
-        state = tried.state[:, 0]
-        allowed = states.contains(state) & (~squares.shown[cloud, rank] | states.showed(state))
-        for k in range(int(rank.max()) + 1):
-            some = (rank == k).nonzero()[:, 0]
-            yield cloud[some], tried.rows(some), error[some], allowed[some]
+        if len(cloud):
+            tried = final.in_proportion(tried, points[cloud], dense[cloud])
+        allowed = states.contains(tried.state[:, 0])
+        allowed &= ~squares.shown[cloud, rank] | states.showed(tried.state[:, 0])
+        error, own = final.distance(tried, points[cloud]), final.distance(start, points)
+        if self.turns.learnt:
+            stood = squares.stood[cloud, rank]
+            least = _least_alike(own, squares.own_stood, error.where(allowed, torch.inf), cloud, stood)
+            error = self._as_likely(error, least[cloud, stood].minimum(error), squares.looks[cloud, rank], tried)
+            own = self._as_likely(own, least.gather(1, squares.own_stood[:, None])[:, 0], squares.own, start)
+        ranks = ((rank == k).nonzero()[:, 0] for k in rank.unique().tolist())
+        return own, ((cloud[some], tried.rows(some), error[some], allowed[some]) for some in ranks)
 
     def _as_likely(
         self,
         error: Tensor,  # [b]
+        least: Tensor,  # [b] of those that stand alike
         looks: Tensor,  # [b] logarithms
         of: Hypotheses,  # H = 1
     ) -> Tensor:  # [b]
-        """Errors, as much larger as what has them is less likely, where looks say that."""
-        if not self.turns.learnt:
-            return error
+        """Errors, as much larger as what has them is less likely, by looks, and by others that stand alike."""
         shown = self.final.registration.states.showed(of.state[:, 0])
-        return error * ((torch.where(shown, 0.0, _UNSEEN) - looks) / _FITS).exp()
+        unlikely = torch.where(shown, 0.0, _UNSEEN) - looks + (_HINGED - _FITS) * (error / least).log()
+        return error * (unlikely / _FITS).exp()
 
     def _hinges(self) -> tuple[Tensor, Tensor]:  # [W, 3, 3], [W]
         """Turns about a door's normal, of hinges that are elsewhere than most, and logarithms of how many are so.
@@ -307,3 +323,16 @@ def _as_said(
 ) -> Tensor:  # [B, C]
     """How much likelier than others what is turned as was said is, a logarithm."""
     return torch.where(angle_to(base[..., :3, :3], said) < ANOTHER_WAY, _SAID, 0.0)
+
+
+def _least_alike(
+    own: Tensor,  # [b]
+    own_stood: Tensor,  # [b]
+    error: Tensor,  # [n]
+    cloud: Tensor,  # [n]
+    stood: Tensor,  # [n]
+) -> Tensor:  # [b, 24]
+    """Of each cloud the least error of what stands each way, infinite where nothing does."""
+    least = torch.full((len(own), 24), torch.inf).to(own)
+    least = least.scatter(1, own_stood[:, None], own[:, None]).flatten()
+    return least.scatter_reduce(0, 24 * cloud + stood, error, "amin").view(len(own), 24)
