@@ -50,6 +50,10 @@ class Looks(NamedTuple):
         best = self.likely.topk(2, dim=1).values
         return best[:, 0] - best[:, 1] > DECIDED
 
+    def rows(self, rows: Tensor) -> Looks:
+        """Those of some of the boxes."""
+        return self._replace(rotation=self.rotation[rows], likely=self.likely[rows])
+
     def of(
         self,
         turn: Tensor,  # [B, C, 3, 3] base rotations
@@ -58,13 +62,19 @@ class Looks(NamedTuple):
 
         And how likely it is, by that and by how many are hinged so, and as which of the 24 ways it stands then.
         """
-        stands = turn[:, :, None] @ self.hinges.mT  # [B, C, W, 3, 3]
-        near = torch.einsum("bcwij,bgij->bcwg", stands, self.rotation).argmax(dim=-1)
-        likely = self.likely - self.likely.amax(dim=1, keepdim=True)
-        found = likely.gather(1, near.flatten(1)).view(near.shape)
+        found, near = self.standing((turn[:, :, None] @ self.hinges.mT).flatten(1, 2))
+        found, near = (value.unflatten(1, (turn.shape[1], -1)) for value in (found, near))
         likely, hinged = (found + self.log_prior).max(dim=-1)
-        stood = near.gather(-1, hinged[..., None]).squeeze(-1)
-        return found[..., 0], found.amax(dim=-1), likely, stood
+        return found[..., 0], found.amax(dim=-1), likely, near.gather(-1, hinged[..., None]).squeeze(-1)
+
+    def standing(
+        self,
+        turn: Tensor,  # [B, C, 3, 3] base rotations
+    ) -> tuple[Tensor, Tensor]:  # [B, C], [B, C]
+        """How right what stands so looks, 0 for what looks likeliest, and as which of the 24 ways it stands."""
+        near = torch.einsum("bcij,bgij->bcg", turn, self.rotation).argmax(dim=-1)
+        likely = self.likely - self.likely.amax(dim=1, keepdim=True)
+        return likely.gather(1, near), near
 
 
 class BoxTurns(WithSurface):

@@ -21,6 +21,7 @@ from articulate_ssl.inference.common_shape import CommonShape
 from articulate_ssl.inference.hinge_sides import closed_state
 from articulate_ssl.inference.hypothesis_registration import HypothesisRegistration
 from articulate_ssl.inference.object_frame import ObjectFrame
+from articulate_ssl.inference.other_hinge import OtherHinge
 from articulate_ssl.inference.part_frames import FARTHEST, PartFrames
 from articulate_ssl.inference.proportions import Descent, fit_proportions
 from articulate_ssl.inference.view_search import ViewSearch
@@ -71,11 +72,15 @@ class FinalFit:
         one: Hypotheses,  # H = 1
         points: Tensor,  # [B, N, 3]
         dense: Tensor | None,  # [B, P, 3]
+        hinge: OtherHinge | None = None,
     ) -> Hypotheses:  # H = 1
         """Explanations in the proportions of clouds (`fit_proportions`), turned as faces say.
 
         Which face is of which part, explanations say, so faces are asked before, and once more of what was fitted. Then
         joints may turn far, if the cloud is explained better.
+
+        Args:
+            hinge: Where all of them are hinged (`hinged_at`), if that is elsewhere than most are.
         """
         if not self.fits:
             return one
@@ -91,13 +96,18 @@ class FinalFit:
         # Complete clouds, and scans that teach views, show where a hinge is.
         both = observation.bidirectional
         descent = Descent(self.cycles, both, touching=both and observation.orientation.limited)
-        if dense is None or not frames.learnt:
+        faces = dense is not None and frames.learnt
+        if faces and self.common_shape.learnt:
+            category = self.common_shape.shape(replace(category.joints, pivot=self.common_shape.pivot))
+        if hinge is not None:
+            frames, category = hinge.frames(frames, category.joints), hinge.shape(category)
+        if not faces:
             return fit_proportions(one, category, points, descent)
         one, known = frames.settled(one, dense)
         descent = descent._replace(faces=frames.axes, known=known)
         if self.common_shape.learnt:
-            category = self.common_shape.shape(category.joints)
-            one = replace(one, structure=replace(one.structure, pivot=self.common_shape.pivots(len(points))))
+            pivot = category.joints.pivot.expand(len(points), -1, -1)
+            one = replace(one, structure=replace(one.structure, pivot=pivot))
         fitted = fit_proportions(one, category, points, descent)
         # Registered with another shape, a part may be so far off that faces of others are taken for its own.
         settled, known = frames.settled(fitted, dense, afar=True)
@@ -110,6 +120,22 @@ class FinalFit:
         closer = self.distance(again, points[rows]) < self.distance(fitted.rows(rows), points[rows])
         kept = (closer | (turn[rows] < FARTHEST)).nonzero()[:, 0]
         return fitted.with_rows(rows[kept], again.rows(kept))
+
+    def hinge(
+        self,
+        turn: Tensor,  # [3, 3] about the closed door's normal
+        axes: Tensor,  # [3, 3] columns: of the object's box, hinge first, the door's normal last
+    ) -> OtherHinge:
+        """Where the category's hinge is turned to, in canonical space; it is known where the door is closed."""
+        shape = self.articulated.category.articulated_shape(REVOLUTE)
+        if self.common_shape.learnt:
+            shape = self.common_shape.shape(replace(shape.joints, pivot=self.common_shape.pivot))
+        return OtherHinge.of(shape, turn, axes, self.registration.states.rest.view(1))
+
+    def hinged_at(self, one: Hypotheses, hinge: OtherHinge) -> Hypotheses:
+        """The category's own shape as explanations are posed, but hinged elsewhere."""
+        shape = hinge.shape(self.articulated.category.articulated_shape(REVOLUTE))
+        return hinge.hypotheses(self.articulated.category_at(one.base, one.state), shape)
 
     def within_limits(
         self,

@@ -148,6 +148,15 @@ class HingeSides(WithSurface):
         """By how many quarters the ways are turned."""
         return torch.arange(0, TURNS, 2 if self.doors else 1, device=self.closed.device)
 
+    @property
+    def hinges(self) -> Tensor:  # [W, 3, 3]
+        """Turns of hinges about the door's normal, in the canonical space of objects that are turned so."""
+        return roma.rotvec_to_rotmat(self.quarters[:, None] * (-math.pi / 2) * self.axes[:, 2])
+
+    def hinged(self, axis: Tensor) -> Tensor:  # [B]
+        """In which of the ways joints with axes [B, 3] are hinged, in canonical space."""
+        return (axis @ (self.hinges @ self.axes[:, 0]).mT.to(axis)).argmax(dim=1)
+
     def measure(self, shape: ArticulatedShape, state_range: Tensor, frames: PartFrames | None = None) -> None:
         """Find axes and the closed door of a category's shape with one joint.
 
@@ -203,7 +212,11 @@ class HingeSides(WithSurface):
         if dense is None or dense.shape[1] < LOOKS * self.size.read:
             return prediction, torch.zeros_like(prediction.joint_parent[:, 0])
         bodies = self.bodies(prediction, dense, (dense,))
-        odds = self.looks_right(bodies) + self.log_prior[: len(self.quarters)].to(dense)
+        ways = len(self.quarters)
+        turned = (
+            self.hinged(prediction.canonical_axis[:, 0])[:, None] + torch.arange(ways, device=dense.device)
+        ) % ways
+        odds = self.looks_right(bodies) + self.log_prior.to(dense)[turned]
         best, ways = odds.topk(2, dim=1)
         undecided = (ways[:, 0] > 0) & (best[:, 0] - odds[:, 0] < (0.0 if self.doors else DECIDED))
         sure = torch.where(undecided, 0.0, (best[:, 0] - best[:, 1]) / (2 * self.surface.temperature))

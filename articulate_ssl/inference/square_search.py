@@ -20,11 +20,9 @@ Views show too little of a box for that, and plates say nothing about which of t
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import roma
 import torch
 from torch import Tensor
 
@@ -38,8 +36,9 @@ from articulate_ssl.inference.candidates import ANOTHER_WAY, angle_to
 from articulate_ssl.inference.contest import CLEARLY, Contest
 from articulate_ssl.inference.final_fit import FinalFit
 from articulate_ssl.inference.hinge_sides import DECIDED, HingeSides
-from articulate_ssl.inference.state_range import StateRange
-from articulate_ssl.network.hypotheses import Hypotheses
+from articulate_ssl.inference.other_hinge import OtherHinge
+from articulate_ssl.network.hypotheses import Hypotheses, concatenated
+from articulate_ssl.shape.articulated_shape import ArticulatedShape
 
 # All chosen on development ovens (docs/experiments.md, step 274).
 _UNSURE = 0.5  # margins below
@@ -57,6 +56,7 @@ _HINGED = 30.0
 _UNSEEN = 2.0
 # By how much likelier, as a logarithm, objects are turned as the network alone says; .5 decides alike, 3 worse.
 _SAID = 1.0
+_STANDING = 3  # ways that look rightest, in which what is hinged elsewhere is sought. Chosen.
 # Of its largest extent the smallest of a box at least (bodies of the package: .66 to .83, plates: .07 and .09).
 _THICK = 0.25
 
@@ -67,58 +67,34 @@ class _Squares(NamedTuple):
     Attributes:
         base: [B, C, 4, 4]
         state: [B, C, 1]
+        hinge: [B, C] where they are hinged, an index of `Looks.hinges`.
         allowed: [B, C] bool, which are tried.
-        shown: [B, C] bool, which only count in joint states that training showed.
         looks: [B, C] how likely they are by their looks, and by what the network alone says, a logarithm.
-        stood: [B, C] as which of the 24 ways they stand (`Looks.of`).
+        stood: [B, C] as which of the 24 ways they stand (`Looks.rotation`).
         own: [B] how likely what is decided for is, so.
         own_stood: [B] as which way it stands.
-        asked: [B] bool, whether any are tried.
         least: [B] share of the error of what is decided for, that another has to be below to take its place.
     """
 
     base: Tensor
     state: Tensor
+    hinge: Tensor
     allowed: Tensor
-    shown: Tensor
     looks: Tensor
     stood: Tensor
     own: Tensor
     own_stood: Tensor
-    asked: Tensor
     least: Tensor
 
     def rows(self, rows: Tensor) -> _Squares:
         """Some of the clouds."""
         return _Squares(*(one[rows] for one in self))
 
-    def looking_right(
-        self,
-        one: Hypotheses,  # H = 1, what is decided for
-        looks: Looks,
-        states: StateRange,
-        said: Tensor | None,  # [B, 3, 3]
-    ) -> _Squares:
-        """Those that look right, likeliest first. How right they look counts as fits do, and so does what was said."""
-        most, anyhow, likely, stood = looks.of(self.base[..., :3, :3])
-        as_most, _, own, own_stood = (value[:, 0] for value in looks.of(one.base[..., :3, :3]))
-        # Registration may leave a closed door open: what is hinged as most are is tried with it closed, too.
-        closed = states.rest.to(self.state).expand_as(self.state)
-        base, state = torch.cat([self.base] * 2, dim=1), torch.cat([self.state, closed], dim=1)
-        right, stands = anyhow > -DECIDED, most > -DECIDED
-        allowed = torch.cat([right & (stands | states.showed(self.state, _REGISTERED)), right & stands], dim=1)
-        shown, likely, stood = (torch.cat([value] * 2, dim=1) for value in (~stands, likely, stood))
-        # What is hinged elsewhere comes after all that is not.
-        order = torch.where(shown, -2 * DECIDED, 0.0) + torch.cat([anyhow] * 2, dim=1)
-        order = order.masked_fill(~allowed, -torch.inf)
-        order = order.argsort(dim=1, descending=True, stable=True)
+    def in_order(self) -> _Squares:
+        """Those that are tried in front, likeliest first."""
+        order = self.looks.masked_fill(~self.allowed, -torch.inf).argsort(dim=1, descending=True, stable=True)
         rows = torch.arange(len(order), device=order.device)[:, None]
-        asked = torch.where(looks.decided, ~states.showed(one.state[:, 0]), self.asked) | (as_most <= -DECIDED)
-        if said is not None:
-            likely, own = likely + _as_said(base, said), own + _as_said(one.base, said)[:, 0]
-            asked |= angle_to(one.base[..., :3, :3], said)[:, 0] > ANOTHER_WAY
-        ordered = (value[rows, order] for value in (base, state, allowed, shown, likely, stood))
-        return _Squares(*ordered, own, own_stood, asked, torch.ones_like(self.least))
+        return _Squares(*(value[rows, order] for value in self[:6]), *self[6:])
 
 
 class SquareSearch:
@@ -169,12 +145,16 @@ class SquareSearch:
         if not self.known or dense is None:
             return one, rival, margin
         frames, _ = manhattan_frames(dense, torch.Generator().manual_seed(0), whole=True)  # of clouds
-        squares = self._squares(one, margin, points, frames)
+        squares, asked = self._squares(one, margin, points, frames)
         if not self.turns.learnt:
-            return self._tried(squares, one, rival, margin, points, dense)
+            rows = asked.nonzero()[:, 0]
+            return self._tried(rows, squares.rows(rows), one, rival, margin, points, dense)
         looks = self.turns.looks(dense, frames, *self._hinges())
-        squares = squares.looking_right(one, looks, self.final.registration.states, said)
-        one, rival, margin = self._tried(squares, one, rival, margin, points, dense)
+        rows = self._doubted(one, asked, looks, said).nonzero()[:, 0]
+        if len(rows):
+            some = one.rows(rows), looks.rows(rows), points[rows], frames[rows], None if said is None else said[rows]
+            squares = self._looking_right(squares.rows(rows), *some)
+            one, rival, margin = self._tried(rows, squares, one, rival, margin, points, dense)
         confirmed = looks.decided & (looks.of(one.base[..., :3, :3])[1][:, 0] > -DECIDED)
         sure = 2 * looks.likely.amax(dim=1).exp() - 1
         return one, rival, torch.where(confirmed, margin.maximum(sure), margin)
@@ -185,19 +165,78 @@ class SquareSearch:
         margin: Tensor,  # [B]
         points: Tensor,  # [B, N, 3]
         frames: Tensor,  # [B, 3, 3] of the clouds
-    ) -> _Squares:
-        """What may take the place of explanations, by how well it fits."""
-        base, state = self._square(points, frames)
-        showed = self.final.registration.states.showed(one.state[:, 0])
+    ) -> tuple[_Squares, Tensor]:  # , [B] bool
+        """What may take the place of explanations, by how well it fits, and which explanations are doubted."""
+        states, shape = self.final.registration.states, self._shape()
+        axes = self.final.part_frames.axes[shape.joints.chain.root]
+        rotations = rotation_group(24).elements.to(points) @ axes.mT
+        base, state, error = self._square(points, frames, rotations.expand(len(points), -1, -1, -1), shape)
+        order = error.argsort(dim=1)
+        rows = torch.arange(len(order), device=order.device)[:, None]
+        base, state = base[rows, order], state[rows, order]
+        showed = states.showed(one.state[:, 0])
         another = angle_to(one.base[..., :3, :3], base[:, 0, :3, :3])[:, 0] > ANOTHER_WAY
         every, least = torch.ones_like(state[..., 0], dtype=torch.bool), torch.where(showed, CLEARLY, 1.0)
-        asked, looks = ~showed | another | (margin < _UNSURE), torch.zeros_like(state[..., 0])
-        stood = torch.zeros_like(every, dtype=torch.long)
-        return _Squares(base, state, every, ~every, looks, stood, looks[:, 0], stood[:, 0], asked, least)
+        alike, none = torch.zeros_like(state[..., 0]), torch.zeros_like(every, dtype=torch.long)
+        squares = _Squares(base, state, none, every, alike, none, alike[:, 0], none[:, 0], least)
+        return squares, ~showed | another | (margin < _UNSURE)
+
+    def _doubted(
+        self,
+        one: Hypotheses,  # H = 1
+        asked: Tensor,  # [B] bool, by how well what is square fits
+        looks: Looks,
+        said: Tensor | None,  # [B, 3, 3]
+    ) -> Tensor:  # [B] bool
+        """Which explanations are doubted, where looks say how they are turned."""
+        most = looks.of(one.base[..., :3, :3])[0][:, 0]
+        asked = torch.where(looks.decided, ~self.final.registration.states.showed(one.state[:, 0]), asked)
+        asked |= most <= -DECIDED
+        return asked if said is None else asked | (angle_to(one.base[..., :3, :3], said)[:, 0] > ANOTHER_WAY)
+
+    def _looking_right(
+        self,
+        squares: _Squares,
+        one: Hypotheses,  # H = 1, what is decided for
+        looks: Looks,
+        points: Tensor,  # [B, N, 3]
+        frames: Tensor,  # [B, 3, 3] of the clouds
+        said: Tensor | None,  # [B, 3, 3]
+    ) -> _Squares:
+        """Those that look right, likeliest first. How right they look counts as fits do, and so does what was said.
+
+        What stands as looks say may be hinged elsewhere.
+        """
+        states = self.final.registration.states
+        own, own_stood = (value[:, 0] for value in looks.of(one.base[..., :3, :3])[2:])
+        found = [(squares.base, squares.state, *looks.standing(squares.base[..., :3, :3]))]
+        if len(looks.hinges) > 1:
+            right, ways = looks.likely.topk(_STANDING, dim=1)
+            rows = torch.arange(len(ways), device=ways.device)[:, None]
+            rotations = frames[:, None] @ looks.rotation[rows, ways]
+            right = right - right[:, :1]
+            for index in range(1, len(looks.hinges)):
+                shape = self._other_hinge(index).shape(self._shape())
+                base, state, _ = self._square(points, frames, rotations, shape)
+                found.append((base, state, right, ways))
+        base, state, right, stood = (torch.cat(some, dim=1) for some in zip(*found, strict=True))
+        hinge = torch.cat([torch.full_like(some[3], index) for index, some in enumerate(found)], dim=1)
+        # Registration may leave a closed door open: all are tried with it closed, too.
+        closed = states.rest.to(state).expand_as(state)
+        base, right, stood, hinge = (torch.cat([value] * 2, dim=1) for value in (base, right, stood, hinge))
+        state = torch.cat([state, closed], dim=1)
+        likely = right + looks.log_prior[hinge]
+        if said is not None:
+            # That is as if all were hinged as most are: what is hinged elsewhere lies.
+            likely = likely + _as_said(base[..., :3, :3] @ looks.hinges[hinge], said)
+            own = own + _as_said(one.base[..., :3, :3], said)[:, 0]
+        least = torch.ones_like(squares.least)
+        return _Squares(base, state, hinge, right > -DECIDED, likely, stood, own, own_stood, least).in_order()
 
     def _tried(
         self,
-        squares: _Squares,
+        doubted: Tensor,  # [b]
+        squares: _Squares,  # of these
         one: Hypotheses,  # H = 1
         rival: Hypotheses,  # H = 1
         margin: Tensor,  # [B]
@@ -205,15 +244,15 @@ class SquareSearch:
         dense: Tensor,  # [B, P, 3]
     ) -> tuple[Hypotheses, Hypotheses, Tensor]:  # H = 1, H = 1, [B]
         """Explanations, or what fits better, once it has the clouds' proportions."""
-        asked = squares.asked.nonzero()[:, 0]
-        for rows in asked.split(_AT_ONCE) if len(asked) else ():
-            some, start = squares.rows(rows), one.rows(rows)
+        for own in torch.arange(len(doubted)).to(doubted).split(_AT_ONCE) if len(doubted) else ():
+            rows, some = doubted[own], squares.rows(own)
+            start = one.rows(rows)
             errors, fits = self._fits(some, start, points[rows], dense[rows])
             contest = Contest(start, rival.rows(rows), margin[rows], errors, self._as_rival)
             for which, tried, error, allowed in fits:
                 tried = contest.one.with_rows(which, tried)
                 error = torch.full_like(some.least, torch.inf).index_copy(0, which, error)
-                allowed = torch.zeros_like(some.asked).index_copy(0, which, allowed)
+                allowed = torch.zeros_like(error, dtype=torch.bool).index_copy(0, which, allowed)
                 contest, _ = contest.against(tried, error, allowed, some.least)
             one, rival = one.with_rows(rows, contest.one), rival.with_rows(rows, contest.rival)
             margin = margin.index_copy(0, rows, contest.margin)
@@ -234,10 +273,8 @@ class SquareSearch:
         final, states = self.final, self.final.registration.states
         cloud, rank = squares.allowed[:, :_TRIED].nonzero().unbind(dim=1)
         tried = final.articulated.category_at(squares.base[cloud, rank, None], squares.state[cloud, rank, None])
-        if len(cloud):
-            tried = final.in_proportion(tried, points[cloud], dense[cloud])
+        tried = self._in_proportion(tried, squares.hinge[cloud, rank], points[cloud], dense[cloud])
         allowed = states.contains(tried.state[:, 0])
-        allowed &= ~squares.shown[cloud, rank] | states.showed(tried.state[:, 0])
         error, own = final.distance(tried, points[cloud]), final.distance(start, points)
         if self.turns.learnt:
             stood = squares.stood[cloud, rank]
@@ -259,36 +296,70 @@ class SquareSearch:
         unlikely = torch.where(shown, 0.0, _UNSEEN) - looks + (_HINGED - _FITS) * (error / least).log()
         return error * (unlikely / _FITS).exp()
 
+    def _in_proportion(
+        self,
+        tried: Hypotheses,  # H = 1
+        hinge: Tensor,  # [n] where they are hinged, an index of `Looks.hinges`
+        points: Tensor,  # [n, N, 3]
+        dense: Tensor,  # [n, P, 3]
+    ) -> Hypotheses:  # H = 1
+        """What is tried, in the clouds' proportions, hinged where it is."""
+        several, order = [], []
+        for index in hinge.unique().tolist():
+            rows = (hinge == index).nonzero()[:, 0]
+            some, other = tried.rows(rows), self._other_hinge(index)
+            some = some if other is None else self.final.hinged_at(some, other)
+            several.append(self.final.in_proportion(some, points[rows], dense[rows], other))
+            order.append(rows)
+        return concatenated(several).rows(torch.cat(order).argsort()) if several else tried
+
     def _hinges(self) -> tuple[Tensor, Tensor]:  # [W, 3, 3], [W]
         """Turns about a door's normal, of hinges that are elsewhere than most, and logarithms of how many are so.
 
-        The turns are in canonical space; none comes first.
+        The turns are in canonical space, the other way round than explanations are turned that lie (`HingeSides`); none
+        comes first.
         """
-        quarters = self.sides.quarters if self.sides.learnt else self.sides.quarters[:1]
-        turns = roma.rotvec_to_rotmat(quarters[:, None] * (math.pi / 2) * self.sides.axes[:, 2])
-        return turns, self.sides.log_prior[: len(quarters)]
+        sides = self.sides
+        ways = len(sides.quarters) if sides.learnt else 1
+        return sides.hinges[:ways], sides.log_prior[:ways]
+
+    def _other_hinge(self, index: int) -> OtherHinge | None:
+        """One that is elsewhere than most, an index of `_hinges`."""
+        if not index:
+            return None
+        return self.final.hinge(self._hinges()[0][index], self.sides.axes)
+
+    def _shape(self) -> ArticulatedShape:
+        return self.final.articulated.category.articulated_shape(REVOLUTE)
 
     def _as_rival(self, one: Hypotheses) -> Hypotheses:
-        """The category's own shape, as rivals have it, where an explanation has that which clouds have in common."""
-        return self.final.articulated.category_at(one.base, one.state)
+        """The category's own shape, as rivals have it, where an explanation has that which clouds have in common.
+
+        What is hinged elsewhere lies as if it were hinged as most are.
+        """
+        turn = self.sides.hinges[self.sides.hinged(one.axis[:, 0, 0])]
+        middle = one.object_shape()[:, one.chain.root].mean(dim=1)
+        base = one.base.clone()
+        base[:, 0, :3, :3] = base[:, 0, :3, :3] @ turn
+        base[:, 0, :3, 3] += (one.base[:, 0, :3, :3] @ (middle - (turn @ middle[..., None])[..., 0])[..., None])[..., 0]
+        return self.final.articulated.category_at(base, one.state)
 
     def _square(
         self,
         points: Tensor,  # [B, N, 3]
         frames: Tensor,  # [B, 3, 3] of the clouds
-    ) -> tuple[Tensor, Tensor]:  # [B, C, 4, 4], [B, C, 1]
-        """Base poses and joint states of registrations from the 24 rotations of the cube, best first."""
-        final, states = self.final, self.final.registration.states
-        shape = final.articulated.category.articulated_shape(REVOLUTE)
-        axes = final.part_frames.axes[shape.joints.chain.root]
-        rotations = rotation_group(24).elements.to(points) @ axes.mT  # [H, 3, 3]
+        rotations: Tensor,  # [B, H, 3, 3] canonical object space -> these frames
+        shape: ArticulatedShape,
+    ) -> tuple[Tensor, Tensor, Tensor]:  # [B, H, 4, 4], [B, H, 1], [B, H]
+        """Base poses and joint states of registrations from rotations, and their errors."""
+        states = self.final.registration.states
         starts, closed = states.starts().to(points), states.rest.to(points)[None]
         starts = torch.cat([closed, closed + (starts[:1] - closed) / 4, starts])  # [Q, 1]
-        sizes = len(points), len(rotations), len(starts)
+        sizes = len(points), rotations.shape[1], len(starts)
 
         posed = shape.posed(torch.eye(4).to(points).expand(len(starts), 4, 4), starts)
-        turned = torch.einsum("hij,qtj->hqti", rotations, posed)
-        least, most = turned.amin(dim=2), turned.amax(dim=2)
+        turned = torch.einsum("bhij,qtj->bhqti", rotations, posed)
+        least, most = turned.amin(dim=3), turned.amax(dim=3)
         inside = points @ frames.mT
         low, high = inside.amin(dim=1), inside.amax(dim=1)
         middle = (low + high) / 2
@@ -296,7 +367,7 @@ class SquareSearch:
         ratio = (most - least) / (high - low)[:, None, None].clamp(min=1e-6)
         ratio = ratio.clamp(1 / _STRETCHED, _STRETCHED)  # [B, H, Q, 3]
         stretched = (inside[:, None, None, :_POINTS] - middle[:, None, None, None]) * ratio[..., None, :]
-        base = se3(rotations[:, None].expand(*sizes, 3, 3), (-(least + most) / 2).expand(*sizes, 3))
+        base = se3(rotations[:, :, None].expand(*sizes, 3, 3), -(least + most) / 2)
         found = register_articulated(
             shape.thinned(_POINTS),
             stretched.flatten(0, 2),
@@ -313,16 +384,15 @@ class SquareSearch:
         base, state, error, ratio = (value[cloud, turn, best] for value in (base, state, error, ratio))
         shift = base[..., :3, 3] / ratio + middle[:, None]
         base = se3(frames.mT, torch.zeros_like(middle))[:, None] @ se3(base[..., :3, :3], shift)
-        order = error.argsort(dim=1)
-        return base[cloud, order], state[cloud, order]
+        return base, state, error
 
 
 def _as_said(
-    base: Tensor,  # [B, C, 4, 4]
+    turn: Tensor,  # [B, C, 3, 3]
     said: Tensor,  # [B, 3, 3]
 ) -> Tensor:  # [B, C]
     """How much likelier than others what is turned as was said is, a logarithm."""
-    return torch.where(angle_to(base[..., :3, :3], said) < ANOTHER_WAY, _SAID, 0.0)
+    return torch.where(angle_to(turn, said) < ANOTHER_WAY, _SAID, 0.0)
 
 
 def _least_alike(
