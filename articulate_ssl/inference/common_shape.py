@@ -52,7 +52,3 @@ class CommonShape(LateBuffers):
         parts, count = self.points.shape[:2]
         label = torch.arange(parts, device=self.points.device).repeat_interleave(count)
         return ArticulatedShape(self.points.flatten(0, 1), label, joints)
-
-    def pivots(self, clouds: int) -> Tensor:  # [B, J, 3]
-        """Where fits of clouds start."""
-        return self.pivot.expand(clouds, -1, -1)

@@ -3,6 +3,7 @@
 A category has one joint. An oven that is hinged at its side is explained as well by one that lies on its side, hinged
 below, and only the body tells which it is. So of a prediction everything in camera space stays, and its frame is turned
 about the door's normal, by a quarter or half a turn, if the body looks as those of most objects do when it is seen so.
+(Where looks say how boxes stand, they are explained as they stand, hinged elsewhere: `other_hinge`, `square_search`.)
 
 A network says how right the body looks (`surface_decision`). It learns that from predictions, most of which are right,
 and without labels; the few that are wrong it would learn as well, if it could tell by anything where the hinge is. So

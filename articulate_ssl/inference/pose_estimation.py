@@ -7,7 +7,7 @@
    (`proportions`), turned as its parts' faces say (`part_frames`), with the shape that clouds of the collection have
    in common (`common_shape`), after which faces are looked at again; and if its joints are then beyond their limits,
    it gives way to what is within them (`final_fit`). Boxes with doors are sought square to their faces, too, with
-   doors as far as closed (`square_search`).
+   doors as far as closed, and hinged at other sides, if some are (`square_search`, `other_hinge`).
    Where parts slide, clouds of other objects that are most like it decide which way round it is; where these are
    labelled, they say which parts points are of, and where the category's shape is (`sliding_search`).
    Where simulated views taught, those that a view is most like decide which way round it is, and say with the
