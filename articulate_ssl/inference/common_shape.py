@@ -8,7 +8,6 @@ object has alone, and without pieces that are of another part. No label is read.
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from articulate_ssl.inference.late_buffers import LateBuffers
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
