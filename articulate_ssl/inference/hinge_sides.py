@@ -213,11 +213,11 @@ class HingeSides(WithSurface):
         if dense is None or dense.shape[1] < LOOKS * self.size.read:
             return prediction, torch.zeros_like(prediction.joint_parent[:, 0])
         bodies = self.bodies(prediction, dense, (dense,))
-        ways = len(self.quarters)
-        turned = (
-            self.hinged(prediction.canonical_axis[:, 0])[:, None] + torch.arange(ways, device=dense.device)
-        ) % ways
-        odds = self.looks_right(bodies) + self.log_prior.to(dense)[turned]
+        count = len(self.quarters)
+        hinged = self.hinged(prediction.canonical_axis[:, 0])
+        # What is hinged elsewhere as it stands is turned to where its hinge is rarer, or more usual.
+        every = (hinged[:, None] + torch.arange(count, device=dense.device)) % count
+        odds = self.looks_right(bodies) + self.log_prior.to(dense)[every]
         best, ways = odds.topk(2, dim=1)
         undecided = (ways[:, 0] > 0) & (best[:, 0] - odds[:, 0] < (0.0 if self.doors else DECIDED))
         sure = torch.where(undecided, 0.0, (best[:, 0] - best[:, 1]) / (2 * self.surface.temperature))

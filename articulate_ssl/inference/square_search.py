@@ -45,8 +45,6 @@ _UNSURE = 0.5  # margins below
 _TRIED = 6  # that take proportions; the truth is among the first five of most
 _STRETCHED = 1.6  # at most, or its inverse
 _POINTS, _SCALES, _ROUNDS = 128, (0.06, 0.03), 4  # of the registration
-# Of the width of a joint's range, beyond it: registration, before proportions, is as far off. Chosen.
-_REGISTERED = 0.15
 _AT_ONCE = 4  # clouds whose explanations take proportions: on a CPU, of one alone that takes three times as long
 # Logarithm of how much likelier something is, by that of how much better it fits; 10 and 15 decide alike.
 _FITS = 12.0
