@@ -309,7 +309,7 @@ class SquareSearch:
             some = some if other is None else self.final.hinged_at(some, other)
             several.append(self.final.in_proportion(some, points[rows], dense[rows], other))
             order.append(rows)
-        return concatenated(several).rows(torch.cat(order).argsort()) if several else tried
+        return concatenated(several).rows(torch.cat(order).argsort())
 
     def _hinges(self) -> tuple[Tensor, Tensor]:  # [W, 3, 3], [W]
         """Turns about a door's normal, of hinges that are elsewhere than most, and logarithms of how many are so.
@@ -335,6 +335,8 @@ class SquareSearch:
 
         What is hinged elsewhere lies as if it were hinged as most are.
         """
+        if not self.sides.learnt:
+            return self.final.articulated.category_at(one.base, one.state)
         turn = self.sides.hinges[self.sides.hinged(one.axis[:, 0, 0])]
         middle = one.object_shape()[:, one.chain.root].mean(dim=1)
         base = one.base.clone()

@@ -131,27 +131,6 @@ def test_a_lying_object_stands_up():
     torch.testing.assert_close(kept.base_pose, prediction.base_pose)
 
 
-def test_who_stands_and_is_hinged_elsewhere_is_as_rare_as_who_lies():
-    prediction, dense, true = lying_boxes([0, 1, 2, 3])
-    sides = box_sides()
-    sides.surface = TopIsUp()
-    prediction = sides.counted_from_closed(prediction)
-    standing, quarters = sides.decided(prediction, dense)
-    assert not sides.hinged(prediction.canonical_axis[:, 0]).any()
-    hinged = sides.hinged(standing.canonical_axis[:, 0])
-    assert torch.equal(hinged, quarters) and sorted(hinged.tolist()) == [0, 1, 2, 3]
-    axis = (true @ sides.hinges[hinged] @ sides.axes[:, 0, None])[..., 0]
-    torch.testing.assert_close(axis, prediction.joint_axis[:, 0], atol=0.03, rtol=0)
-    assert not sides.decided(standing, dense)[1].any()
-    # Where it is never so, it lies.
-    sides.log_prior.copy_(torch.tensor([0.0, -1e3, -1e3, -1e3]))
-    lying, _ = sides.decided(standing, dense)
-    torch.testing.assert_close(lying.base_pose[:, :3, :3], prediction.base_pose[:, :3, :3], atol=0.03, rtol=0)
-    # Doors are upside down, or not.
-    sides.doors.fill_(True)
-    assert len(sides.hinges) == 2 and sides.hinged(standing.canonical_axis[:, 0])[hinged == 2].tolist() == [1]
-
-
 @pytest.mark.parametrize(("doors", "likelier", "turns"), [(False, 2.1, 1), (False, 1.9, 0), (True, 0.1, 2)])
 def test_what_is_undecided_of_a_body_stays_and_doors_are_believed(doors, likelier, turns):
     prediction, dense, _ = lying_boxes([2] if doors else [1], knob=doors)

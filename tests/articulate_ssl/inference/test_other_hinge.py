@@ -6,6 +6,7 @@ import pytest
 import roma
 import torch
 from articulated_objects import OVEN, clouds, true_shape
+from boxes_with_doors import TopIsUp, box_sides, lying_boxes
 from true_category import final_fit
 
 from articulate_ssl.geometry.se3 import se3
@@ -89,3 +90,24 @@ def test_explanations_are_posed_as_the_shape_is(shape):
     category = final.articulated.shape
     posed = other.shape(category).posed(base, state)
     torch.testing.assert_close(one.posed()[0, 0].flatten(0, 1), posed[0], atol=1e-5, rtol=0)
+
+
+def test_who_stands_and_is_hinged_elsewhere_is_as_rare_as_who_lies():
+    prediction, dense, true = lying_boxes([0, 1, 2, 3])
+    sides = box_sides()
+    sides.surface = TopIsUp()
+    prediction = sides.counted_from_closed(prediction)
+    standing, quarters = sides.decided(prediction, dense)
+    assert not sides.hinged(prediction.canonical_axis[:, 0]).any()
+    hinged = sides.hinged(standing.canonical_axis[:, 0])
+    assert torch.equal(hinged, quarters) and sorted(hinged.tolist()) == [0, 1, 2, 3]
+    axis = (true @ sides.hinges[hinged] @ sides.axes[:, 0, None])[..., 0]
+    torch.testing.assert_close(axis, prediction.joint_axis[:, 0], atol=0.03, rtol=0)
+    assert not sides.decided(standing, dense)[1].any()
+    # Where it is never so, it lies.
+    sides.log_prior.copy_(torch.tensor([0.0, -1e3, -1e3, -1e3]))
+    lying, _ = sides.decided(standing, dense)
+    torch.testing.assert_close(lying.base_pose[:, :3, :3], prediction.base_pose[:, :3, :3], atol=0.03, rtol=0)
+    # Doors are upside down, or not.
+    sides.doors.fill_(True)
+    assert len(sides.hinges) == 2 and sides.hinged(standing.canonical_axis[:, 0])[hinged == 2].tolist() == [1]

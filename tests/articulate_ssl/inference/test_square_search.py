@@ -263,6 +263,10 @@ def test_rivals_that_are_hinged_elsewhere_lie(search, data):
     middles = [(one.posed()[:, 0, 0]).mean(dim=1) for one in (standing, lying)]
     torch.testing.assert_close(*middles, atol=1e-5, rtol=0)
     assert torch.equal(search._as_rival(_at(search, data.base, data.state)).base, data.base[:, None])
+    # Where none is hinged elsewhere, nothing is known of how the box lies.
+    search.sides.learnt.fill_(False)
+    search.sides.axes.copy_(torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]))
+    assert torch.equal(search._as_rival(_at(search, data.base, data.state)).base, data.base[:, None])
 
 
 @pytest.mark.parametrize("where", ["views", "plates", "not faces", "no dense points"])
