@@ -22,6 +22,7 @@
    well either explains them decides (`handedness`).
 7. *Poses* of a prediction that is not registered, and which parts points are of, a network says that fits taught, in
    the frame of that prediction (`pose_network`).
+8. *Hinges* of boxes with doors: where the closed door lies on its body (`closed_contact`).
 
 Training takes the first two steps too; nothing here knows a loss or an optimiser.
 """
@@ -45,6 +46,7 @@ from articulate_ssl.inference.candidates import (
     better,
     rivals,
 )
+from articulate_ssl.inference.closed_contact import resting_on_bodies
 from articulate_ssl.inference.common_shape import CommonShape
 from articulate_ssl.inference.decision import BothWays, Decision
 from articulate_ssl.inference.final_fit import ABOUT_AS_WELL, FinalFit
@@ -137,6 +139,7 @@ class PoseEstimator(Proposals):
         pose_network: Which poses fits would say, if that was taught; a module owns it.
         box_turns: Which way round boxes with doors look right, if that was taught; a module owns it.
         closed_views: Simulated views of doors that are nearly closed, if there were any; a module owns it.
+        closes_doors: Whether hinges are where closed doors lie on their bodies; an ablation asks what that is worth.
     """
 
     def __init__(
@@ -162,6 +165,7 @@ class PoseEstimator(Proposals):
         self.pose_network = PoseNetwork(articulated.num_parts)
         self.box_turns = BoxTurns()
         self.closed_views = ViewSearch(articulated.num_parts)
+        self.closes_doors = True
         super().__init__(articulated, rigid, iterations, replace(observation, camera=self.hinge_sides.camera))
         self.registration = HypothesisRegistration(inference, self.observation, self.states)
         self.decision = Decision(articulated, self.registration, self.two_ways)
@@ -251,12 +255,24 @@ class PoseEstimator(Proposals):
         if not torch.isfinite(points).all():
             raise ValueError("a cloud has NaN or infinite points")
         found, rival = self._decided(points, dense, how)
-        # Similar views say parts, too, and better than posed shapes; whether better than this network was not asked.
-        if not how.fits or dense is None or not self.pose_network.learnt or (how.registers and self.view_search.learnt):
+        if not how.fits or dense is None:
             return found, rival
-        says = self.pose_network.labelled if how.registers else self.pose_network.posed
         with torch.autocast(points.device.type, enabled=False):
-            return says(found, points, dense), rival
+            # Similar views say parts, too, and better than posed shapes; whether better than this network was not
+            # asked.
+            if self.pose_network.learnt and not (how.registers and self.view_search.learnt):
+                says = self.pose_network.labelled if how.registers else self.pose_network.posed
+                found = says(found, points, dense)
+            if how.registers and self.closes:
+                closed = self.states.rest - self.hinge_sides.closed * self.hinge_sides.learnt
+                found = resting_on_bodies(found, dense, closed)
+        return found, rival
+
+    @property
+    def closes(self) -> bool:
+        """Whether doors are closed to see where their hinges are: it is known how, and clouds show all sides."""
+        known = bool(self.states.rests) and self.articulated.num_parts == 2
+        return self.closes_doors and known and not self.observation.orientation.limited
 
     def _decided(self, points: Tensor, dense: Tensor | None, how: _How) -> tuple[Prediction, Prediction]:
         """See `_predicted`: before a network says poses."""

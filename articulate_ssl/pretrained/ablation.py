@@ -89,6 +89,10 @@ def _no_free_space(estimator: PoseEstimator) -> None:
     estimator.other_views.reaches = 0.0
 
 
+def _no_contact(estimator: PoseEstimator) -> None:
+    estimator.closes_doors = False
+
+
 def _no_network_of_views_parts(estimator: PoseEstimator) -> None:
     estimator.view_search.parts = None
 
@@ -130,6 +134,7 @@ ABLATIONS = (
         lambda of: of.object_frame.learnt,
         lambda of: of.object_frame.forget(),
     ),
+    Ablation("where closed doors lie on bodies", lambda of: of.closes, _no_contact),
     Ablation("which side is up", lambda of: bool(of.hinge_sides.learnt), _no_sides),
     Ablation("mirror images", lambda of: bool(of.handedness.learnt), lambda of: of.handedness.learnt.fill_(False)),
     Ablation("joint limits", lambda of: of.states.learnt, lambda of: of.states.forget()),
