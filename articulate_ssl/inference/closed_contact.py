@@ -10,6 +10,10 @@ until they do not.
 What a closed door lies on need not be known. Seen from the front, in every small cell that shows both, there is a gap
 between the door's back and what the body has behind it. Where the door lies on its frame, these gaps are all as wide,
 and elsewhere as deep as it comes: the most frequent one tells, unless the door would be in the body then.
+
+Of plates, as a laptop's, faces do not say how they are turned, and explanations have their hinges off in the same way,
+across them, too. A gap tells one of both; as it tells another at every angle, training clouds, together, tell both
+(`training/contact_lesson.py`), and a cloud what is left.
 """
 
 from __future__ import annotations
@@ -20,8 +24,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from articulate_ssl.geometry.screw import screw_motion
+from articulate_ssl.geometry.screw import axis_angle_to_rotation, screw_motion
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
+from articulate_ssl.inference.late_buffers import LateBuffers
 from articulate_ssl.inference.prediction import Prediction
 
 # Lengths are in normalised units; all were chosen on development ovens (docs/experiments.md, step 347).
@@ -33,6 +38,23 @@ _FEWEST = 48  # points of a door, and of a body, with which it is looked at
 _CELLS = 8  # that show both
 # Standard deviations of where hinges are, before: across the door, along it; and of gaps as they are seen.
 _ACROSS, _ALONG, _SEEN = 0.007, 0.03, 0.01
+_ROUNDS = 30  # of weighing clouds
+
+
+class ClosedPlates(LateBuffers):
+    """Plates that lie on each other when they are closed, as training clouds showed them.
+
+    Attributes:
+        learnt: [] whether they do.
+        closed: [] joint state at which they are, about.
+        off: [2] where hinges are, from where they are predicted: across the plate that moves, and along it (`Contact`).
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("learnt", torch.tensor(False))
+        self.register_buffer("closed", torch.tensor(0.0))
+        self.register_buffer("off", torch.zeros(2))
 
 
 class Contact(NamedTuple):
@@ -56,34 +78,57 @@ class Contact(NamedTuple):
         found: Prediction,  # K = 2, the joint turns
         dense: Tensor,  # [B, P, 3] points that `found.dense_part_id` is of
         closed: Tensor,  # [] joint state at which doors are closed
+        plates: bool = False,
     ) -> Contact:
-        """Of predictions, about the hinges that they have."""
+        """Of predictions, about the hinges that they have.
+
+        Args:
+            plates: Whether parts are plates, which are parallel when they are closed, whatever joint states say.
+        """
         child = int(found.joint_child[0, 0])
         turn = screw_motion(found.joint_axis, found.joint_pivot, closed - found.joint_state, 0)[:, 0, :3, :3]
         rows = [
-            _seen(cloud - pivot, own == child, axis, back)
+            _seen(cloud - pivot, own == child, axis, back, plates)
             for cloud, own, axis, pivot, back in zip(
                 dense, found.dense_part_id, found.joint_axis[:, 0], found.joint_pivot[:, 0], turn, strict=True
             )
         ]
         return Contact(*map(torch.stack, zip(*rows, strict=True)))
 
-    def shift(self) -> Tensor:  # [B, 3]
+    def shift(
+        self,
+        off: Tensor | None = None,  # [2] where hinges are, of all clouds; None: where they are predicted
+    ) -> Tensor:  # [B, 3]
         """Where hinges are to be moved, as is likeliest: by as little as explains the gaps, rather along doors."""
-        spread = self.slope.new_tensor([_ACROSS, _ALONG]).square()
-        gain = spread * self.slope
+        off = torch.zeros_like(self.slope[0]) if off is None else off.to(self.slope)
+        gain = self.slope.new_tensor([_ACROSS, _ALONG]).square() * self.slope
         gain = gain / ((gain * self.slope).sum(dim=1, keepdim=True) + _SEEN**2)
-        shift = torch.einsum("bk,bki->bi", gain * self.gap[:, None], self.directions)
-        return torch.where(self.known[:, None], shift, 0)
+        left = torch.where(self.known, self.gap - self.slope @ off, 0)
+        return torch.einsum("bk,bki->bi", off + gain * left[:, None], self.directions)
+
+    def off(self) -> Tensor:  # [2]
+        """Where the hinges of all clouds are, together: by which gaps are as wide as they are.
+
+        Clouds whose gap stays count less, as a Cauchy loss has it.
+        """
+        slope, gap = self.slope[self.known], self.gap[self.known]
+        trust, found = torch.ones_like(gap), torch.zeros_like(slope[0])
+        for _ in range(_ROUNDS):
+            weighted = trust[:, None] * slope
+            found = torch.linalg.solve(weighted.mT @ slope + _SEEN**2 * torch.eye(2).to(slope), weighted.mT @ gap)
+            trust = 1 / (1 + ((gap - slope @ found) / _SEEN).square())
+        return found
 
 
 def resting_on_bodies(
     found: Prediction,  # K = 2, the joint turns
     dense: Tensor,  # [B, P, 3] points that `found.dense_part_id` is of
     closed: Tensor,  # [] joint state at which doors are closed
+    off: Tensor | None = None,  # [2] of plates, see `ClosedPlates`
 ) -> Prediction:
-    """The same parts, as they are turned, about hinges with which closed doors lie on their bodies."""
-    return _hinged(found, found.joint_pivot[:, 0] + Contact.of(found, dense, closed).shift())
+    """The same parts, as they are turned, about hinges with which closed doors, or plates, lie on their bodies."""
+    contact = Contact.of(found, dense, closed, plates=off is not None)
+    return _hinged(found, found.joint_pivot[:, 0] + contact.shift(off))
 
 
 def _hinged(
@@ -104,6 +149,7 @@ def _seen(
     own: Tensor,  # [P] bool, the door's
     axis: Tensor,  # [3] unit
     back: Tensor,  # [3, 3] turns the door to closed
+    plates: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """See `Contact`, of one cloud."""
     door, body = points[own] @ back.mT, points[~own]
@@ -111,14 +157,27 @@ def _seen(
         none = points.new_zeros(2)
         return none[0], own.new_zeros(()), points.new_zeros(2, 3), none
     plane = torch.linalg.svd(axis[None]).Vh[1:].T  # [3, 2] that the door turns in
-    normal, along = (plane @ torch.linalg.eigh(torch.cov((door @ plane).T)).eigenvectors).T
-    normal = normal * (normal @ body.mean(dim=0)).sign()
+    normal, along = _extends(door, plane)
+    if plates:
+        onto = _extends(body, plane)[0]
+        onto = onto * (onto @ normal).sign()
+        more = axis_angle_to_rotation(axis, torch.atan2(torch.linalg.cross(normal, onto) @ axis, normal @ onto))
+        door, normal, along, back = door @ more.mT, onto, more @ along, more @ back
+    normal = normal * (normal @ (body.mean(dim=0) - door.mean(dim=0))).sign()
     along = along * (along @ door.mean(dim=0)).sign()
     closed = torch.stack([normal, along])
     directions = closed @ back  # as the door is
     frame = torch.cat([closed, axis[None]]).T
     gaps = _gaps(door @ frame, body @ frame)
     return _most_frequent(gaps), gaps.new_tensor(len(gaps) >= _CELLS).bool(), directions, (directions - closed) @ normal
+
+
+def _extends(
+    points: Tensor,  # [p, 3]
+    plane: Tensor,  # [3, 2]
+) -> Tensor:  # [2, 3] unit
+    """The directions in a plane in which points extend least, and most."""
+    return (plane @ torch.linalg.eigh(torch.cov((points @ plane).T)).eigenvectors).T
 
 
 def _gaps(

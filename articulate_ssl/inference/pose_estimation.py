@@ -46,7 +46,7 @@ from articulate_ssl.inference.candidates import (
     better,
     rivals,
 )
-from articulate_ssl.inference.closed_contact import resting_on_bodies
+from articulate_ssl.inference.closed_contact import ClosedPlates, resting_on_bodies
 from articulate_ssl.inference.common_shape import CommonShape
 from articulate_ssl.inference.decision import BothWays, Decision
 from articulate_ssl.inference.final_fit import ABOUT_AS_WELL, FinalFit
@@ -139,6 +139,7 @@ class PoseEstimator(Proposals):
         pose_network: Which poses fits would say, if that was taught; a module owns it.
         box_turns: Which way round boxes with doors look right, if that was taught; a module owns it.
         closed_views: Simulated views of doors that are nearly closed, if there were any; a module owns it.
+        closed_plates: Where hinges of plates are, if that was learnt; a module owns it.
         closes_doors: Whether hinges are where closed doors lie on their bodies; an ablation asks what that is worth.
     """
 
@@ -165,6 +166,7 @@ class PoseEstimator(Proposals):
         self.pose_network = PoseNetwork(articulated.num_parts)
         self.box_turns = BoxTurns()
         self.closed_views = ViewSearch(articulated.num_parts)
+        self.closed_plates = ClosedPlates()
         self.closes_doors = True
         super().__init__(articulated, rigid, iterations, replace(observation, camera=self.hinge_sides.camera))
         self.registration = HypothesisRegistration(inference, self.observation, self.states)
@@ -264,15 +266,21 @@ class PoseEstimator(Proposals):
                 says = self.pose_network.labelled if how.registers else self.pose_network.posed
                 found = says(found, points, dense)
             if how.registers and self.closes:
-                closed = self.states.rest - self.hinge_sides.closed * self.hinge_sides.learnt
-                found = resting_on_bodies(found, dense, closed)
+                found = self._rested(found, dense)
         return found, rival
 
     @property
     def closes(self) -> bool:
         """Whether doors are closed to see where their hinges are: it is known how, and clouds show all sides."""
-        known = bool(self.states.rests) and self.articulated.num_parts == 2
+        known = bool(self.states.rests or self.closed_plates.learnt) and self.articulated.num_parts == 2
         return self.closes_doors and known and not self.observation.orientation.limited
+
+    def _rested(self, found: Prediction, dense: Tensor) -> Prediction:
+        """The same about hinges with which closed doors lie on their bodies."""
+        if self.closed_plates.learnt:
+            return resting_on_bodies(found, dense, self.closed_plates.closed, self.closed_plates.off)
+        closed = self.states.rest - self.hinge_sides.closed * self.hinge_sides.learnt
+        return resting_on_bodies(found, dense, closed)
 
     def _decided(self, points: Tensor, dense: Tensor | None, how: _How) -> tuple[Prediction, Prediction]:
         """See `_predicted`: before a network says poses."""

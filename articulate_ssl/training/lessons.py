@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.training.box_lessons import learn_box_turns
 from articulate_ssl.training.closed_door_lesson import learn_closed_doors
+from articulate_ssl.training.contact_lesson import learn_closed_contact
 from articulate_ssl.training.explanations import learn_handedness, learn_two_ways
 from articulate_ssl.training.frame_lessons import learn_part_frames
 from articulate_ssl.training.hinge_lessons import learn_hinge_sides
@@ -31,7 +32,8 @@ if TYPE_CHECKING:
 # and again when it is known how faces lie: that moves states.
 LESSONS = (
     *("first_limits", "two_ways", "turns", "objects", "handedness", "part_frames", "view_turns", "hinge_sides"),
-    *("joint_limits", "closed_doors", "view_looks", "poses", "box_turns", "standing_part", "confidence"),
+    *("joint_limits", "closed_contact", "closed_doors", "view_looks", "poses", "box_turns", "standing_part"),
+    "confidence",
 )
 
 
@@ -100,6 +102,7 @@ def plan(module: ArticulatedPoseModule) -> dict[str, Lesson]:
         "view_turns": Lesson(learn_view_turns, two_ways if refines and views else 0),
         "hinge_sides": Lesson(learn_hinge_sides, module.hinge_sides_samples if refines else 0),
         "joint_limits": limits,
+        "closed_contact": Lesson(learn_closed_contact, calibration if refines and turns and any_way else 0),
         "closed_doors": Lesson(learn_closed_doors, module.closed_views_samples if doors else 0, of_scans=True),
         "view_looks": Lesson(learn_view_looks, module.view_looks_samples if doors else 0, of_scans=True),
         "poses": Lesson(learn_poses, module.pose_samples if refines and turns else 0),

@@ -143,7 +143,7 @@ class ArticulatedPoseModel(nn.Module):
         self.part_frames, self.common_shape = self.estimator.part_frames, self.estimator.common_shape
         self.object_frame, self.front_ends = self.estimator.object_frame, self.estimator.front_ends
         self.pose_network, self.box_turns = self.estimator.pose_network, self.estimator.box_turns
-        self.closed_views = self.estimator.closed_views
+        self.closed_views, self.closed_plates = self.estimator.closed_views, self.estimator.closed_plates
         self.recipe = recipe_type(self.estimator, objective, schedule, discovery)
         self.radius = RadiusStatistics()
         self.standing_part = StandingPart()
