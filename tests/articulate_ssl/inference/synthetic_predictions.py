@@ -70,10 +70,10 @@ def chain_of_boxes(boxes, joints, states, num_points=512, shape_points=256, seed
     return prediction, transform_points(part_pose, dense).reshape(-1, 3)[:num_points]
 
 
-def laptop(angle=1.2, seed=0):
+def laptop(angle=1.2, seed=0, points=512):
     """Base and lid, hinge at the back along x; the canonical object is closed."""
     boxes = [((0.8, 0.55, 0.04), (0, 0, 0)), ((0.8, 0.55, 0.03), (0, 0, 0.04))]
-    return chain_of_boxes(boxes, [(REVOLUTE, 0, 1, (-1.0, 0, 0), (0, 0.275, 0.02))], [angle], seed=seed)
+    return chain_of_boxes(boxes, [(REVOLUTE, 0, 1, (-1.0, 0, 0), (0, 0.275, 0.02))], [angle], points, seed=seed)
 
 
 def drawer(states=(0.2, 0.1, 0.0), seed=0):
