@@ -140,7 +140,6 @@ class PoseEstimator(Proposals):
         box_turns: Which way round boxes with doors look right, if that was taught; a module owns it.
         closed_views: Simulated views of doors that are nearly closed, if there were any; a module owns it.
         closed_plates: Where hinges of plates are, if that was learnt; a module owns it.
-        closes_doors: Whether hinges are where closed doors lie on their bodies; an ablation asks what that is worth.
     """
 
     def __init__(
@@ -167,7 +166,6 @@ class PoseEstimator(Proposals):
         self.box_turns = BoxTurns()
         self.closed_views = ViewSearch(articulated.num_parts)
         self.closed_plates = ClosedPlates()
-        self.closes_doors = True
         super().__init__(articulated, rigid, iterations, replace(observation, camera=self.hinge_sides.camera))
         self.registration = HypothesisRegistration(inference, self.observation, self.states)
         self.decision = Decision(articulated, self.registration, self.two_ways)
@@ -273,7 +271,7 @@ class PoseEstimator(Proposals):
     def closes(self) -> bool:
         """Whether doors are closed to see where their hinges are: it is known how, and clouds show all sides."""
         known = bool(self.states.rests or self.closed_plates.learnt) and self.articulated.num_parts == 2
-        return self.closes_doors and known and not self.observation.orientation.limited
+        return self.inference.closed_contact and known and not self.observation.orientation.limited
 
     def _rested(self, found: Prediction, dense: Tensor) -> Prediction:
         """The same about hinges with which closed doors lie on their bodies."""

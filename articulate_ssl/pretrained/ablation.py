@@ -90,7 +90,7 @@ def _no_free_space(estimator: PoseEstimator) -> None:
 
 
 def _no_contact(estimator: PoseEstimator) -> None:
-    estimator.closes_doors = False
+    estimator.inference = replace(estimator.inference, closed_contact=False)
 
 
 def _no_network_of_views_parts(estimator: PoseEstimator) -> None:

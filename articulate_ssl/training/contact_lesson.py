@@ -59,11 +59,7 @@ def learn_closed_contact(
         return
     known.off.copy_(contact.off())
     known.learnt.fill_(True)
-    before, after = (
-        apart[contact.known].abs().median() for apart in (contact.gap, contact.gap - contact.slope @ known.off)
-    )
-    text = "closed plates: hinges are %.3f off across, %.3f along; gaps of %.3f then, before %.3f"
-    tell(log, text, *known.off.tolist(), after, before)
+    tell(log, "closed plates: hinges are %.3f off across plates, %.3f along them", *known.off.tolist())
 
 
 def _thickness(points: Tensor) -> float:
