@@ -26,8 +26,8 @@ class InferenceOptions:
         part_neighbours: So many points of a posed part say by their mean distance how near it is to a point, which
             belongs to the nearest part; null leaves it to the recipe (1 staged, 6 paper, whose shapes have some points
             on other parts).
-        closed_contact: Move hinges of boxes with doors, and of plates, to where the part that turns lies on the other when
-            it is closed (`closed_contact.py`); of complete clouds that are registered.
+        closed_contact: Move hinges of boxes with doors, and of plates, to where the part that turns lies on the other
+            when it is closed (`closed_contact.py`); of complete clouds that are registered.
         columns: Report at test time, from the same clouds, what the category's shape without a network reaches, the
             network alone, and the network with registration (`training/columns.py`).
     """
