@@ -64,6 +64,7 @@ class InstanceFit:
         axes: [K, 3, 3] columns along which parts stretch instead; joint axes then stay as they are.
         faces: [K, 3, 3] columns along which parts stretch instead, and nothing else.
         log_stretch: [n, K, 3] start; none by default.
+        bound: Largest log-stretch.
         beside: [n, K, 3] start of where else parts lie, with `axes`; none by default. Along a slide it stays as it is,
             as how far a part has slid says the same.
     """
@@ -78,15 +79,16 @@ class InstanceFit:
         log_stretch: Tensor | None = None,
         beside: Tensor | None = None,
         faces: Tensor | None = None,
+        bound: float = _BOUND,
     ) -> None:
         self._shape, self._base, self._generator = shape, base, generator
         self._axis, self._pivot, self._state = shape.joints.axis.clone(), shape.joints.pivot.clone(), state.clone()
         self._turn, self._shift = (base.new_zeros(len(base), 3) for _ in range(2))
         self._start = self._pivot.clone() if self._pivot.dim() == 3 else None
-        self._held = _HELD
+        self._held, self._bound = _HELD, bound
         self._stretch, self._beside = (base.new_zeros(len(base), shape.num_parts, 3) for _ in range(2))
         if log_stretch is not None:
-            self._stretch += _BOUND * (log_stretch / _BOUND).clamp(-_START, _START).atanh()
+            self._stretch += bound * (log_stretch / bound).clamp(-_START, _START).atanh()
         if beside is not None:
             self._beside += beside
         self.axes, given = axes, faces if axes is None else axes
@@ -116,7 +118,7 @@ class InstanceFit:
     @property
     def log_stretch(self) -> Tensor:
         """[n, K, 3] of every part along its principal axes, within the bound."""
-        return _BOUND * (self._stretch / _BOUND).tanh()
+        return self._bound * (self._stretch / self._bound).tanh()
 
     @property
     def beside(self) -> Tensor | None:
@@ -134,7 +136,7 @@ class InstanceFit:
         pivots[joint] = pivot
         moved = replace(shape, joints=replace(shape.joints, pivot=pivots))
         state = moved.read_states(shape.joints.part_pose(base, state))
-        other = InstanceFit(moved, base, state, self._generator, self.axes)
+        other = InstanceFit(moved, base, state, self._generator, self.axes, bound=self._bound)
         other._stretch, other._beside = self._stretch.clone(), self._beside.clone()
         return other
 

@@ -3,9 +3,11 @@
 Objects of a category differ in proportions, and the network's stretches say so only roughly. Where a part is longer or
 shorter than its shape, registration turns it to make up for that. So in the end pose, joint states, the stretch of
 every part and where its hinge is descend together, each cloud's on its own (`discovery.instance_fit`), to a smaller
-distance between cloud and shape. Parts stay hinged, axes stay as the network says. Where distances count one way, what
-a view hides pulls at nothing. Where parts were found in views alone, which leave open where their hinge is, parts are
-drawn to it.
+distance between cloud and shape. Where faces say along which axes parts stretch, they start as wide as the whole cloud
+is: what is far off hardly pulls, and bodies half as wide again as their category's stayed as they were, so that other
+explanations won (docs/experiments.md, step 349). Parts stay hinged, axes stay as the network says. Where distances
+count one way, what a view hides pulls at nothing. Where parts were found in views alone, which leave open where their
+hinge is, parts are drawn to it.
 """
 
 from __future__ import annotations
@@ -21,6 +23,9 @@ from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.network.heads.shape import CanonicalShape
 from articulate_ssl.network.hypotheses import Hypotheses
 from articulate_ssl.shape.articulated_shape import ArticulatedShape
+
+_WIDEST = 0.5  # largest log-stretch of what starts as wide as its cloud: 1.65. Chosen.
+_ENDS = 0.005  # share of points beyond what is taken for the ends of a cloud, or a shape: strays are some. Chosen.
 
 
 class Descent(NamedTuple):
@@ -90,8 +95,34 @@ def descended(
         seen, still = transform_points(invert_se3(base), points.clone()), torch.eye(4).to(base).expand_as(base)
         faces = None if faces is None else faces.clone()
         axes = None if frame is None else frame.expand(shape.num_parts, 3, 3).clone()
-        generator = torch.Generator().manual_seed(0)
-        fit = InstanceFit(shape, still, one.state[:, 0].clone(), generator, axes, faces=faces)
+        state, generator = one.state[:, 0].clone(), torch.Generator().manual_seed(0)
+        if faces is not None and both:
+            start = _as_wide_as(seen, shape, state, faces)
+            fit = InstanceFit(shape, still, state, generator, axes, start, faces=faces, bound=_WIDEST)
+        else:
+            fit = InstanceFit(shape, still, state, generator, axes, faces=faces)
         known = None if known is None else tuple(value.clone() for value in known)
         fit.optimise(seen, cycles, shared=False, bidirectional=both, touching=touching, known=known)
         return fit, base
+
+
+@torch.no_grad()
+def _as_wide_as(
+    clouds: Tensor,  # [B, N, 3] in the frame of the shape
+    shape: ArticulatedShape,
+    state: Tensor,  # [B, J]
+    faces: Tensor,  # [K, 3, 3] columns
+) -> Tensor:  # [B, K, 3]
+    """Log-stretches of parts along their faces, with which the whole is about as wide as clouds are.
+
+    Along the axes of the root, all parts by as much; others as they are turned.
+    """
+    root, still = shape.joints.chain.root, torch.eye(4).to(clouds).expand(len(clouds), 4, 4)
+    axes = faces[root]
+    ratio = _extents(clouds @ axes) / _extents(shape.posed(still, state) @ axes).clamp(min=1e-6)
+    turned = shape.joints.part_pose(still, state)[..., :3, :3] @ faces  # [B, K, 3, 3]
+    return (ratio[:, None, :, None] * (axes.mT @ turned)).norm(dim=2).log()
+
+
+def _extents(points: Tensor) -> Tensor:  # [B, N, 3] -> [B, 3]
+    return points.quantile(1 - _ENDS, dim=1) - points.quantile(_ENDS, dim=1)

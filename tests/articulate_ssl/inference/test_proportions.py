@@ -1,5 +1,6 @@
 """Explanations take the proportions of their clouds: what that mends, and what it leaves alone."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -10,8 +11,8 @@ from tiny import POINTS, tiny_module
 
 from articulate_ssl.discovery.registration import chamfer_l1, register_articulated
 from articulate_ssl.geometry.orientation_range import OrientationRange
-from articulate_ssl.geometry.se3 import se3, transform_points
-from articulate_ssl.inference import final_fit
+from articulate_ssl.geometry.se3 import invert_se3, se3, transform_points
+from articulate_ssl.inference import final_fit, proportions
 from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.inference.proportions import Descent, fit_proportions
 from articulate_ssl.network.heads.shape import CanonicalShape
@@ -193,3 +194,43 @@ def test_parts_are_drawn_to_a_hinge_that_floats(monkeypatch):
         _observe(module, Observation(OrientationRange(views), unidirectional))
         module.predict_points(torch.rand(1, POINTS, 3))
     assert seen == [(True, True), (True, False), (False, False)]
+
+
+WIDE = torch.tensor([1.0, 1.0, 1.6])  # along the hinge
+FACES = torch.eye(3).repeat(2, 1, 1)
+
+
+@pytest.fixture(scope="module")
+def wide_oven():
+    """Clouds of ovens more than half as wide again as the category, and explanations that are turned right."""
+    data = clouds(OVEN, count=4, points=600, resample=True)
+    shape = _category(OVEN, data)
+    own = transform_points(invert_se3(data.base), data.points)
+    return data._replace(points=transform_points(data.base, own * WIDE)), shape, _registered(shape, data)
+
+
+def test_what_is_much_wider_is_explained_as_wide_as_it_is(wide_oven):
+    data, shape, start = wide_oven
+    faces = fit_proportions(start, shape, data.points, Descent(CYCLES, faces=FACES))
+    bodies = faces.object_shape()[:, 0]
+    wide = (bodies.amax(dim=1) - bodies.amin(dim=1)) / (shape.part(0).amax(dim=0) - shape.part(0).amin(dim=0))
+    torch.testing.assert_close(wide, WIDE.expand_as(wide), atol=0.08, rtol=0)
+    assert (_error(faces, data) < 0.8 * _error(fit_proportions(start, shape, data.points, Descent(CYCLES)), data)).all()
+
+
+def test_parts_start_as_wide_as_clouds_as_they_are_turned(wide_oven):
+    """A door that hangs at right angles is deep where the body is high."""
+    data, shape, start = wide_oven
+    stretch = torch.tensor([1.2, 0.9, 1.1])
+    still, state = torch.eye(4).expand(1, 4, 4), torch.tensor([[math.pi / 2]])
+    cloud = shape.posed(still, state) * stretch
+    found = proportions._as_wide_as(cloud, shape, state, FACES).exp()[0]
+    torch.testing.assert_close(found[0], stretch, atol=1e-4, rtol=0)
+    turn = shape.joints.part_pose(still, state)[0, 1, :3, :3]
+    torch.testing.assert_close(found[1], (turn.mT @ stretch).abs(), atol=1e-4, rtol=0)
+
+
+def test_of_views_nothing_starts_as_wide_as_they_are(wide_oven, monkeypatch):
+    data, shape, start = wide_oven
+    monkeypatch.setattr(proportions, "_as_wide_as", lambda *_: pytest.fail("asked of a view"))
+    fit_proportions(start, shape, data.points, Descent(1, bidirectional=False, faces=FACES))
