@@ -220,7 +220,7 @@ def test_what_is_much_wider_is_explained_as_wide_as_it_is(wide_oven):
 
 def test_parts_start_as_wide_as_clouds_as_they_are_turned(wide_oven):
     """A door that hangs at right angles is deep where the body is high."""
-    data, shape, start = wide_oven
+    _, shape, _ = wide_oven
     stretch = torch.tensor([1.2, 0.9, 1.1])
     still, state = torch.eye(4).expand(1, 4, 4), torch.tensor([[math.pi / 2]])
     cloud = shape.posed(still, state) * stretch
