@@ -24,7 +24,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from articulate_ssl.geometry.screw import axis_angle_to_rotation, screw_motion
+from articulate_ssl.geometry.screw import REVOLUTE, axis_angle_to_rotation, screw_motion
 from articulate_ssl.geometry.se3 import invert_se3, transform_points
 from articulate_ssl.inference.late_buffers import LateBuffers
 from articulate_ssl.inference.prediction import Prediction
@@ -35,7 +35,7 @@ _REACH, _STEP = 0.12, 0.0025  # gaps that are tried: from the door being so far 
 _ALIKE = 0.01  # standard deviation of gaps that are as wide
 _INSIDE = 0.25  # as many cells speak for a gap as it leaves in the body, times so much
 _FEWEST = 48  # points of a door, and of a body, with which it is looked at
-_CELLS = 8  # that show both
+_CELLS, _TOGETHER = 8, 4  # that show both, and whose gaps are as wide: with fewer it is not known how it closes
 # Standard deviations of where hinges are, before: across the door, along it; and of gaps as they are seen.
 _ACROSS, _ALONG, _SEEN = 0.007, 0.03, 0.01
 _ROUNDS = 30  # of weighing clouds
@@ -86,7 +86,7 @@ class Contact(NamedTuple):
             plates: Whether parts are plates, which are parallel when they are closed, whatever joint states say.
         """
         child = int(found.joint_child[0, 0])
-        turn = screw_motion(found.joint_axis, found.joint_pivot, closed - found.joint_state, 0)[:, 0, :3, :3]
+        turn = screw_motion(found.joint_axis, found.joint_pivot, closed - found.joint_state, REVOLUTE)[:, 0, :3, :3]
         rows = [
             _seen(cloud - pivot, own == child, axis, back, plates)
             for cloud, own, axis, pivot, back in zip(
@@ -137,7 +137,7 @@ def _hinged(
 ) -> Prediction:
     """The same poses and states about a joint line elsewhere: in the canonical shape the part is elsewhere."""
     child, back = int(found.joint_child[0, 0]), invert_se3(found.base_pose)
-    at_rest = screw_motion(found.joint_axis, pivot[:, None], -found.joint_state, int(found.joint_type[0, 0]))[:, 0]
+    at_rest = screw_motion(found.joint_axis, pivot[:, None], -found.joint_state, REVOLUTE)[:, 0]
     assembly = found.assembly.clone()
     assembly[:, child] = transform_points(back @ at_rest, found.part_pose[:, child, None, :3, 3])[:, 0]
     canonical = transform_points(back, pivot[:, None])
@@ -168,8 +168,8 @@ def _seen(
     closed = torch.stack([normal, along])
     directions = closed @ back  # as the door is
     frame = torch.cat([closed, axis[None]]).T
-    gaps = _gaps(door @ frame, body @ frame)
-    return _most_frequent(gaps), gaps.new_tensor(len(gaps) >= _CELLS).bool(), directions, (directions - closed) @ normal
+    gap, known = _most_frequent(_gaps(door @ frame, body @ frame))
+    return gap, known, directions, (directions - closed) @ normal
 
 
 def _extends(
@@ -196,10 +196,11 @@ def _gaps(
     return (front - back)[(front - back).isfinite()]
 
 
-def _most_frequent(gaps: Tensor) -> Tensor:  # []
-    """How wide most of the narrow ones are."""
+def _most_frequent(gaps: Tensor) -> tuple[Tensor, Tensor]:  # [], []
+    """How wide most of the narrow ones [C] are, and whether there are enough of them."""
     tried = torch.arange(-_REACH, _REACH + _STEP / 2, _STEP).to(gaps)
     wider = gaps - tried[:, None]
     alike = (wider.square() / (-2 * _ALIKE**2)).exp().sum(dim=1)
     inside = ((-wider - 2 * _ALIKE) / (_ALIKE / 2)).sigmoid().sum(dim=1)
-    return tried[(alike - _INSIDE * inside).argmax()]
+    best = (alike - _INSIDE * inside).argmax()
+    return tried[best], (alike[best] >= _TOGETHER) & (len(gaps) >= _CELLS)

@@ -120,6 +120,14 @@ def test_where_hardly_anything_is_seen_nothing_is_moved():
     torch.testing.assert_close(found.joint_pivot, wrong.joint_pivot)
 
 
+def test_a_door_that_closes_on_nothing_says_nothing():
+    """Its hinge is so far before the body that no gap is as wide as is tried."""
+    truth, dense = oven(90)
+    wrong = moved(truth, 0.4)
+    assert not Contact.of(wrong, dense, CLOSED).known.any()
+    torch.testing.assert_close(resting_on_bodies(wrong, dense, CLOSED).joint_pivot, wrong.joint_pivot)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_it_turns_with_the_cloud(dtype):
     ovens = [oven(opened) for opened in (50, 100)]
