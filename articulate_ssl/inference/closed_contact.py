@@ -56,6 +56,13 @@ class ClosedPlates(LateBuffers):
         self.register_buffer("closed", torch.tensor(0.0))
         self.register_buffer("off", torch.zeros(2))
 
+    def closing(
+        self,
+        rest: Tensor,  # [] joint state at which the door of a box is closed
+    ) -> tuple[Tensor, Tensor | None]:
+        """How `resting_on_bodies` closes what is predicted: the joint state, and of plates where hinges are."""
+        return (self.closed, self.off) if self.learnt else (rest, None)
+
 
 class Contact(NamedTuple):
     """How closed doors lie on their bodies, of B clouds.

@@ -258,13 +258,13 @@ class PoseEstimator(Proposals):
         if not how.fits or dense is None:
             return found, rival
         with torch.autocast(points.device.type, enabled=False):
-            # Similar views say parts, too, and better than posed shapes; whether better than this network was not
-            # asked.
+            # Similar views say parts, too, better than posed shapes; whether better than this network was not asked.
             if self.pose_network.learnt and not (how.registers and self.view_search.learnt):
                 says = self.pose_network.labelled if how.registers else self.pose_network.posed
                 found = says(found, points, dense)
             if how.registers and self.closes:
-                found = self._rested(found, dense)
+                rest = self.states.rest - self.hinge_sides.closed * self.hinge_sides.learnt
+                found = resting_on_bodies(found, dense, *self.closed_plates.closing(rest))
         return found, rival
 
     @property
@@ -272,13 +272,6 @@ class PoseEstimator(Proposals):
         """Whether doors are closed to see where their hinges are: it is known how, and clouds show all sides."""
         known = bool(self.states.rests or self.closed_plates.learnt) and self.articulated.num_parts == 2
         return self.inference.closed_contact and known and not self.observation.orientation.limited
-
-    def _rested(self, found: Prediction, dense: Tensor) -> Prediction:
-        """The same about hinges with which closed doors lie on their bodies."""
-        if self.closed_plates.learnt:
-            return resting_on_bodies(found, dense, self.closed_plates.closed, self.closed_plates.off)
-        closed = self.states.rest - self.hinge_sides.closed * self.hinge_sides.learnt
-        return resting_on_bodies(found, dense, closed)
 
     def _decided(self, points: Tensor, dense: Tensor | None, how: _How) -> tuple[Prediction, Prediction]:
         """See `_predicted`: before a network says poses."""

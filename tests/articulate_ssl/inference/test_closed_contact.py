@@ -11,7 +11,7 @@ from synthetic_predictions import chain_of_boxes, laptop
 from articulate_ssl.geometry.screw import REVOLUTE
 from articulate_ssl.geometry.se3 import se3, transform_points
 from articulate_ssl.inference.articulation import part_motion
-from articulate_ssl.inference.closed_contact import Contact, resting_on_bodies
+from articulate_ssl.inference.closed_contact import ClosedPlates, Contact, resting_on_bodies
 from articulate_ssl.inference.prediction import concatenate
 
 CLOSED = torch.tensor(0.3)  # states count from somewhere
@@ -201,3 +201,10 @@ def test_a_plate_is_hinged_where_most_are_and_where_it_closes(angle):
     assert apart(found, truth) < 0.008
     unlike = resting_on_bodies(wrong, dense, ABOUT_CLOSED, torch.zeros(2))
     assert apart(found, truth) < apart(unlike, truth)
+
+
+def test_boxes_close_as_their_faces_say_and_plates_as_training_showed():
+    plates, rest = ClosedPlates(), torch.tensor(0.7)
+    assert plates.closing(rest) == (rest, None)
+    plates.learnt.fill_(True)
+    assert plates.closing(rest)[0] is plates.closed and plates.closing(rest)[1] is plates.off
