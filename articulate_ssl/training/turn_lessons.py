@@ -1,8 +1,8 @@
 """How it is learnt which way round objects with sliding parts are, from what is said of training clouds.
 
-No label is read. `inference.sliding_search` compares a whole cloud with clouds of the collection, and
-`inference.view_search` a depth view with simulated ones; what they say of a few they get wrong, and a network that sees
-their surface, taught by all, is right of most of these.
+No label is read. `inference.sliding_search` compares a whole cloud with a few clouds of the collection, and then all
+that teach are compared with each other; `inference.view_search` compares a depth view with simulated ones. What they
+say of a few they get wrong, and a network that sees their surface, taught by all, is right of most of these.
 """
 
 from __future__ import annotations
@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
+from articulate_ssl.discovery.synchronization import turned_as_the_alike
 from articulate_ssl.inference.surface_decision import SurfaceDecision
-from articulate_ssl.ops.progress import announced
+from articulate_ssl.ops.progress import announced, tell
 from articulate_ssl.training.explanations import with_noise
 from articulate_ssl.training.line_lessons import explain
 from articulate_ssl.training.surface_lessons import learn_surface
@@ -37,7 +39,10 @@ def learn_turns(
     sliding, generator = module.estimator.sliding, torch.Generator().manual_seed(0)
     sliding.surface = None  # of a run that ended and goes on
     shown = announced(log, "turns of the collection", clouds.split(_BATCH))
-    frames = torch.cat([sliding.leading_turns(some.cpu())[0].mT for some in shown]).to(clouds)
+    turns = torch.cat([sliding.leading_turns(some.cpu())[0] for some in shown])
+    chosen = turned_as_the_alike(turns, clouds.cpu())
+    tell(log, "clouds most alike turn %.1f %% of all otherwise", 100 * float((chosen > 0).double().mean()))
+    frames = _first(turns, chosen).mT.to(clouds)
     sliding.surface = _taught(clouds, frames, torch.ones(len(clouds), dtype=torch.bool), generator)
 
 
@@ -55,6 +60,15 @@ def learn_view_turns(
     batches = zip(views.split(_BATCH), explained.split(_BATCH), strict=True)
     square, has = zip(*(frame.square(*some) for some in batches), strict=True)
     frame.surface = _taught(views, torch.cat(square) @ frame.axes, torch.cat(has), generator)
+
+
+def _first(
+    turns: Tensor,  # [n, C, 3, 3]
+    chosen: Tensor,  # [n]
+) -> Tensor:  # [n, C, 3, 3]
+    """The chosen turn of each cloud before all others, which keep their order."""
+    order = functional.one_hot(chosen, turns.shape[1]).argsort(dim=1, descending=True, stable=True)
+    return turns[torch.arange(len(turns))[:, None], order]
 
 
 def _taught(

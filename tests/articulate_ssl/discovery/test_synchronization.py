@@ -8,6 +8,7 @@ from articulate_ssl.discovery.synchronization import (
     standing_margins,
     synchronise,
     total_cost,
+    turned_as_the_alike,
     unit_boxes,
 )
 from articulate_ssl.geometry.rotation_group import rotation_group
@@ -85,3 +86,33 @@ def test_clouds_that_stand_otherwise_have_the_smallest_margins():
     margins = standing_margins(unit_boxes(shapes)[0], group)
     assert sorted(margins.argsort()[:2].tolist()) == [3, 7]
     assert margins[[3, 7]].max() < -0.1 and margins.sort().values[2] > -0.05
+
+
+def _of_two_kinds(generator: torch.Generator) -> torch.Tensor:  # [40, 300, 3]
+    """Clouds of two kinds of objects in turn, without symmetries; the corner that the kinds lack is another."""
+    points = torch.rand(40, 3000, 3, generator=generator) - 0.5
+    lacks = (points > 0).all(dim=-1), (points * torch.tensor([1.0, -1.0, -1.0]) > 0).all(dim=-1)
+    return torch.stack(
+        [cloud[~lacks[i % 2][i] & (cloud[:, 2] < 0.3 + cloud[:, 0])][:300] for i, cloud in enumerate(points)]
+    )
+
+
+def test_clouds_turn_as_those_most_alike_stand():
+    group, generator = rotation_group(24), torch.Generator().manual_seed(0)
+    elements = group.elements.float()
+    # Of every fifth cloud, another turn is the likeliest; all have four.
+    right = torch.where(torch.arange(40) % 5 == 1, 1 + torch.arange(40) % 3, 0)
+    offered = torch.stack([torch.randperm(23, generator=generator)[:4] + 1 for _ in right])
+    offered[torch.arange(40), right] = group.identity
+    pose = elements[torch.randint(24, (40,), generator=generator)]
+    clouds = _of_two_kinds(generator) @ pose.mT
+    turns = elements[offered] @ pose.mT[:, None]
+    assert torch.equal(turned_as_the_alike(turns, clouds), right)
+
+
+def test_what_stands_already_stays_and_one_cloud_has_nobody_to_ask():
+    generator = torch.Generator().manual_seed(1)
+    clouds = _of_two_kinds(generator)
+    turns = rotation_group(24).elements.float()[:4].expand(40, 4, 3, 3)
+    assert not turned_as_the_alike(turns, clouds).any()
+    assert turned_as_the_alike(turns[:1], clouds[:1]).tolist() == [0]

@@ -12,18 +12,22 @@ from articulate_ssl.training.lessons import teach
 from articulate_ssl.training.turn_lessons import learn_turns, learn_view_turns
 
 
-def test_the_leading_turns_are_taught_the_likeliest_as_right(monkeypatch):
+def test_the_leading_turns_are_taught_with_that_of_the_clouds_most_alike_as_right(monkeypatch):
     module, handed = tiny_module(joint_type="prismatic").eval(), []
     points = torch.rand(20, POINTS, 3, generator=torch.Generator().manual_seed(0))
     turn = torch.linalg.qr(torch.randn(20, 4, 3, 3, generator=torch.Generator().manual_seed(1))).Q
-    shown = iter(turn.split(16))
+    shown, chosen = iter(turn.split(16)), torch.zeros(20, dtype=torch.long)
+    chosen[3] = 2
     monkeypatch.setattr(module.sliding, "leading_turns", lambda some: (next(shown), torch.zeros(len(some), 4)))
+    monkeypatch.setattr(turn_lessons, "turned_as_the_alike", lambda turns, _: chosen)
     monkeypatch.setattr(turn_lessons, "learn_surface", lambda *lesson: handed.append(lesson))
     learn_turns(module, points)
     ((versions, frames, order, least),) = handed
     assert torch.equal(versions[0], points) and not torch.equal(versions[1], points)
     assert (versions[1] - points).abs().max() < 0.06
-    assert torch.equal(frames, turn.mT) and order.sort().values.tolist() == list(range(20))
+    right_first = turn.clone()
+    right_first[3] = turn[3, [2, 0, 1, 3]]
+    assert torch.equal(frames, right_first.mT) and order.sort().values.tolist() == list(range(20))
     assert least == 0.9
 
 
