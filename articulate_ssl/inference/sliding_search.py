@@ -125,15 +125,23 @@ class SlidingSearch(WithSurface):
         labelled: LabelledClouds | None = None,
     ) -> None:
         """Keep a shape, some of the clouds it was found in, spread evenly, and all whose points have parts."""
-        some = torch.linspace(0, len(clouds) - 1, min(len(clouds), _GALLERY)).round().long()
-        boxes, _, _ = unit_boxes(clouds[some] @ base[some, :3, :3])
-        self.gallery = boxes[:, :_GALLERY_POINTS].to(self.gallery, copy=True)
+        self.learn_standing(clouds, base[:, :3, :3])
         if labelled is not None:
             self.learn_labelled(labelled)
         self.points.copy_(shape.points.view_as(self.points))
         self.axis.copy_(shape.joints.axis)
         self.pivot.copy_(shape.joints.pivot)
         self.limits.copy_(limits)
+
+    def learn_standing(
+        self,
+        clouds: Tensor,  # [n, N, 3] training clouds
+        rotation: Tensor,  # [n, 3, 3] canonical orientation -> cloud
+    ) -> None:
+        """Keep some of the clouds, spread evenly, in place of others that turns are told by."""
+        some = torch.linspace(0, len(clouds) - 1, min(len(clouds), _GALLERY)).round().long()
+        boxes, _, _ = unit_boxes(clouds[some] @ rotation[some])
+        self.gallery = boxes[:, :_GALLERY_POINTS].to(self.gallery, copy=True)
 
     def learn_labelled(self, labelled: LabelledClouds) -> None:
         """Keep clouds whose points have parts, in place of others."""

@@ -22,9 +22,11 @@ from articulate_ssl.training.line_lessons import explain
 from articulate_ssl.training.surface_lessons import learn_surface
 
 if TYPE_CHECKING:
+    from articulate_ssl.inference.sliding_search import SlidingSearch
     from articulate_ssl.training.module import ArticulatedPoseModule
 
 _BATCH = 16
+_FEW = 512  # clouds that stand each other up before all are asked
 _AGREE = 0.9  # share of the clouds that it was not taught by, of which a network must say what it was taught
 
 log = logging.getLogger(__name__)
@@ -35,15 +37,30 @@ def learn_turns(
     module: ArticulatedPoseModule,
     clouds: Tensor,  # [n, N, 3] farthest-point order, dense
 ) -> None:
-    """Teach a network which of the leading turns is right."""
+    """Teach a network which of the leading turns is right, and keep clouds that stand as those most like them do.
+
+    A few clouds stand each other up first: some that discovery kept stand otherwise.
+    """
     sliding, generator = module.estimator.sliding, torch.Generator().manual_seed(0)
     sliding.surface = None  # of a run that ended and goes on
-    shown = announced(log, "turns of the collection", clouds.split(_BATCH))
-    turns = torch.cat([sliding.leading_turns(some.cpu())[0] for some in shown])
-    chosen = turned_as_the_alike(turns, clouds.cpu())
-    tell(log, "clouds most alike turn %.1f %% of all otherwise", 100 * float((chosen > 0).double().mean()))
-    frames = _first(turns, chosen).mT.to(clouds)
+    _as_the_alike(sliding, clouds[:_FEW].cpu())
+    frames = _as_the_alike(sliding, clouds.cpu()).mT.to(clouds)
     sliding.surface = _taught(clouds, frames, torch.ones(len(clouds), dtype=torch.bool), generator)
+
+
+def _as_the_alike(
+    sliding: SlidingSearch,
+    clouds: Tensor,  # [n, N, 3]
+) -> Tensor:  # [n, C, 3, 3]
+    """The leading turns of each cloud, that in which it is like others first; the search goes by these then."""
+    shown = announced(log, "turns of the collection", clouds.split(_BATCH))
+    turns = torch.cat([sliding.leading_turns(some)[0] for some in shown])
+    chosen = turned_as_the_alike(turns, clouds)
+    tell(log, "clouds most alike turn %.1f %% of all otherwise", 100 * float((chosen > 0).double().mean()))
+    order = functional.one_hot(chosen, turns.shape[1]).argsort(dim=1, descending=True, stable=True)
+    turns = turns[torch.arange(len(turns))[:, None], order]
+    sliding.learn_standing(clouds, turns[:, 0].mT)
+    return turns
 
 
 @torch.no_grad()
@@ -60,15 +77,6 @@ def learn_view_turns(
     batches = zip(views.split(_BATCH), explained.split(_BATCH), strict=True)
     square, has = zip(*(frame.square(*some) for some in batches), strict=True)
     frame.surface = _taught(views, torch.cat(square) @ frame.axes, torch.cat(has), generator)
-
-
-def _first(
-    turns: Tensor,  # [n, C, 3, 3]
-    chosen: Tensor,  # [n]
-) -> Tensor:  # [n, C, 3, 3]
-    """The chosen turn of each cloud before all others, which keep their order."""
-    order = functional.one_hot(chosen, turns.shape[1]).argsort(dim=1, descending=True, stable=True)
-    return turns[torch.arange(len(turns))[:, None], order]
 
 
 def _taught(

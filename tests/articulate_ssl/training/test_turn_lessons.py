@@ -6,20 +6,22 @@ import torch
 from articulated_objects import CHEST, clouds
 from tiny import POINTS, tiny_module
 
+from articulate_ssl.discovery.synchronization import unit_boxes
 from articulate_ssl.inference.options import InferenceOptions
 from articulate_ssl.training import turn_lessons
 from articulate_ssl.training.lessons import teach
 from articulate_ssl.training.turn_lessons import learn_turns, learn_view_turns
 
 
-def test_the_leading_turns_are_taught_with_that_of_the_clouds_most_alike_as_right(monkeypatch):
+def test_the_turn_of_the_clouds_most_alike_is_taught_as_right_and_the_search_goes_by_it(monkeypatch):
     module, handed = tiny_module(joint_type="prismatic").eval(), []
     points = torch.rand(20, POINTS, 3, generator=torch.Generator().manual_seed(0))
     turn = torch.linalg.qr(torch.randn(20, 4, 3, 3, generator=torch.Generator().manual_seed(1))).Q
-    shown, chosen = iter(turn.split(16)), torch.zeros(20, dtype=torch.long)
+    shown, chosen = iter(turn[:12].split(16) + turn.split(16)), torch.zeros(20, dtype=torch.long)
     chosen[3] = 2
+    monkeypatch.setattr(turn_lessons, "_FEW", 12)
     monkeypatch.setattr(module.sliding, "leading_turns", lambda some: (next(shown), torch.zeros(len(some), 4)))
-    monkeypatch.setattr(turn_lessons, "turned_as_the_alike", lambda turns, _: chosen)
+    monkeypatch.setattr(turn_lessons, "turned_as_the_alike", lambda turns, _: chosen[: len(turns)])
     monkeypatch.setattr(turn_lessons, "learn_surface", lambda *lesson: handed.append(lesson))
     learn_turns(module, points)
     ((versions, frames, order, least),) = handed
@@ -27,6 +29,8 @@ def test_the_leading_turns_are_taught_with_that_of_the_clouds_most_alike_as_righ
     assert (versions[1] - points).abs().max() < 0.06
     right_first = turn.clone()
     right_first[3] = turn[3, [2, 0, 1, 3]]
+    standing = unit_boxes(points @ right_first[:, 0].mT)[0]
+    assert torch.equal(module.sliding.gallery, standing[:, : module.sliding.gallery.shape[1]])
     assert torch.equal(frames, right_first.mT) and order.sort().values.tolist() == list(range(20))
     assert least == 0.9
 
