@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from articulate_ssl.geometry.rotation_group import rotation_group
+from articulate_ssl.inference.alike_boxes import AlikeBoxes
 from articulate_ssl.inference.hinge_sides import DECIDED
 from articulate_ssl.inference.surface_decision import WithSurface
 from articulate_ssl.inference.upright_camera import UprightCamera
@@ -37,12 +38,14 @@ class Looks(NamedTuple):
         likely: [B, 24] logarithms of probabilities.
         hinges: [W, 3, 3] turns about the door's normal, of hinges that are elsewhere than most; none comes first.
         log_prior: [W] logarithms of the shares of objects that are hinged so.
+        alike: [B, 24] the same as `likely` by the training clouds most alike, of what is hinged as most are.
     """
 
     rotation: Tensor
     likely: Tensor
     hinges: Tensor
     log_prior: Tensor
+    alike: Tensor
 
     @property
     def decided(self) -> Tensor:
@@ -52,7 +55,8 @@ class Looks(NamedTuple):
 
     def rows(self, rows: Tensor) -> Looks:
         """Those of some of the boxes."""
-        return self._replace(rotation=self.rotation[rows], likely=self.likely[rows])
+        own = {"rotation": self.rotation, "likely": self.likely, "alike": self.alike}
+        return self._replace(**{name: value[rows] for name, value in own.items()})
 
     def of(
         self,
@@ -72,9 +76,20 @@ class Looks(NamedTuple):
         turn: Tensor,  # [B, C, 3, 3] base rotations
     ) -> tuple[Tensor, Tensor]:  # [B, C], [B, C]
         """How right what stands so looks, 0 for what looks likeliest, and as which of the 24 ways it stands."""
-        near = torch.einsum("bcij,bgij->bcg", turn, self.rotation).argmax(dim=-1)
+        near = self._ways(turn)
         likely = self.likely - self.likely.amax(dim=1, keepdim=True)
         return likely.gather(1, near), near
+
+    def like_others(
+        self,
+        turn: Tensor,  # [B, C, 3, 3] base rotations, of what is hinged as most are
+    ) -> Tensor:  # [B, C]
+        """How like training clouds what is turned so is, 0 for what is most like them."""
+        return (self.alike - self.alike.amax(dim=1, keepdim=True)).gather(1, self._ways(turn))
+
+    def _ways(self, turn: Tensor) -> Tensor:
+        """As which of the 24 ways what is turned [B, C, 3, 3] stands [B, C]."""
+        return torch.einsum("bcij,bgij->bcg", turn, self.rotation).argmax(dim=-1)
 
 
 class BoxTurns(WithSurface):
@@ -84,17 +99,19 @@ class BoxTurns(WithSurface):
         axes: [3, 3] columns: of the frame in which boxes look right, in canonical space.
         camera: Which way is up for the camera of the views that taught it, where `hinge_sides` does not know that.
         surface: How right clouds look in a frame; None if it was not taught.
+        alike: Training clouds to compare with, if some are kept.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.register_buffer("axes", torch.eye(3))
         self.camera = UprightCamera()
+        self.alike = AlikeBoxes()
 
     @property
     def learnt(self) -> bool:
-        """Whether the network was taught."""
-        return self.surface is not None
+        """Whether the network was taught, or clouds are kept."""
+        return self.surface is not None or self.alike.learnt
 
     @torch.no_grad()
     def looks(
@@ -115,9 +132,13 @@ class BoxTurns(WithSurface):
         """
         every = frames.mT[:, None] @ rotation_group(24).elements.to(frames)
         rotation = every @ self.axes.mT.to(frames)
-        looks = self.surface.looks_right(every, dense) / self.surface.temperature
+        if self.surface is None:
+            looks = dense.new_zeros(every.shape[:2])
+        else:
+            looks = self.surface.looks_right(every, dense) / self.surface.temperature
         if seen is not None:
             looks = looks.masked_fill(~seen(rotation), -torch.inf)
         hinges = torch.eye(3)[None] if hinges is None else hinges
         log_prior = torch.zeros(len(hinges)) if log_prior is None else log_prior
-        return Looks(rotation, looks.log_softmax(dim=1), hinges.to(frames), log_prior.to(frames))
+        alike = self.alike.likely(dense, every)
+        return Looks(rotation, looks.log_softmax(dim=1), hinges.to(frames), log_prior.to(frames), alike)

@@ -189,7 +189,7 @@ class SquareSearch:
         """Which explanations are doubted, where looks say how they are turned."""
         most = looks.of(one.base[..., :3, :3])[0][:, 0]
         asked = torch.where(looks.decided, ~self.final.registration.states.showed(one.state[:, 0]), asked)
-        asked |= most <= -DECIDED
+        asked |= (most <= -DECIDED) | (looks.like_others(one.base[..., :3, :3])[:, 0] <= -DECIDED)
         return asked if said is None else asked | (angle_to(one.base[..., :3, :3], said)[:, 0] > ANOTHER_WAY)
 
     def _looking_right(
@@ -223,13 +223,15 @@ class SquareSearch:
         closed = states.rest.to(state).expand_as(state)
         base, right, stood, hinge = (torch.cat([value] * 2, dim=1) for value in (base, right, stood, hinge))
         state = torch.cat([state, closed], dim=1)
-        likely = right + looks.log_prior[hinge]
+        # What training clouds and the network say is as if all were hinged as most are: what is hinged elsewhere lies.
+        lying = base[..., :3, :3] @ looks.hinges[hinge]
+        alike = looks.like_others(lying)
+        likely, own = right + looks.log_prior[hinge] + alike, own + looks.like_others(one.base[..., :3, :3])[:, 0]
         if said is not None:
-            # That is as if all were hinged as most are: what is hinged elsewhere lies.
-            likely = likely + _as_said(base[..., :3, :3] @ looks.hinges[hinge], said)
+            likely = likely + _as_said(lying, said)
             own = own + _as_said(one.base[..., :3, :3], said)[:, 0]
-        least = torch.ones_like(squares.least)
-        return _Squares(base, state, hinge, right > -DECIDED, likely, stood, own, own_stood, least).in_order()
+        allowed, least = right.maximum(alike) > -DECIDED, torch.ones_like(squares.least)
+        return _Squares(base, state, hinge, allowed, likely, stood, own, own_stood, least).in_order()
 
     def _tried(
         self,

@@ -69,14 +69,16 @@ def doors_closed_further(
     clouds: Tensor,  # [B, P, 3]
     rest: Tensor,  # [1] joint state of a closed door, as predictions count
     generator: torch.Generator,
+    nearly: float = 0.5,
 ) -> Tensor:  # [B, P, 3]
     """Clouds whose doors are turned about their hinges, as predicted, to a state between their own and a closed one's.
 
-    Half of them nearly all the way.
+    Args:
+        nearly: Share of those that are turned nearly all the way.
     """
     state = found.joint_state[:, 0]
-    share, nearly = torch.rand(2, len(clouds), generator=generator).to(clouds)
-    share = torch.where(nearly < 0.5, _NEARLY * share, share)
+    share, chance = torch.rand(2, len(clouds), generator=generator).to(clouds)
+    share = torch.where(chance < nearly, _NEARLY * share, share)
     motion = screw_motion(found.joint_axis[:, 0], found.joint_pivot[:, 0], (1 - share) * (rest - state), REVOLUTE)
     door = found.dense_part_id == found.joint_child[:, :1]
     return torch.where(door[..., None], transform_points(motion, clouds), clouds)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from articulate_ssl.geometry.screw import REVOLUTE
+from articulate_ssl.training.alike_lesson import learn_alike_boxes
 from articulate_ssl.training.box_lessons import learn_box_turns
 from articulate_ssl.training.closed_door_lesson import learn_closed_doors
 from articulate_ssl.training.contact_lesson import learn_closed_contact
@@ -32,8 +33,8 @@ if TYPE_CHECKING:
 # and again when it is known how faces lie: that moves states.
 LESSONS = (
     *("first_limits", "two_ways", "turns", "objects", "handedness", "part_frames", "view_turns", "hinge_sides"),
-    *("joint_limits", "closed_contact", "closed_doors", "view_looks", "poses", "box_turns", "standing_part"),
-    "confidence",
+    *("joint_limits", "closed_contact", "closed_doors", "view_looks", "poses", "alike_boxes", "box_turns"),
+    *("standing_part", "confidence"),
 )
 
 
@@ -106,6 +107,7 @@ def plan(module: ArticulatedPoseModule) -> dict[str, Lesson]:
         "closed_doors": Lesson(learn_closed_doors, module.closed_views_samples if doors else 0, of_scans=True),
         "view_looks": Lesson(learn_view_looks, module.view_looks_samples if doors else 0, of_scans=True),
         "poses": Lesson(learn_poses, module.pose_samples if refines and turns else 0),
+        "alike_boxes": Lesson(learn_alike_boxes, module.alike_boxes_samples if refines and turns and any_way else 0),
         "box_turns": Lesson(learn_box_turns, module.box_turns_samples if refines and turns and any_way else 0),
         "standing_part": Lesson(learn_standing_part, 0 if any_way else calibration),
         "confidence": Lesson(learn_confidence, calibration),

@@ -75,6 +75,8 @@ class ArticulatedPoseModel(nn.Module):
             too, where simulated views teach (`inference.other_views`); 0 simulates none.
         view_looks_samples: Views of scans, most of them with doors nearly closed, by which a network learns which way
             round boxes look in views (`inference.other_views`); 10 minutes. 0 learns none.
+        alike_boxes_samples: Training clouds of boxes with doors that are kept, as predicted, and say how others are
+            turned that are like them (`inference.alike_boxes`); 10 minutes to register them. 0 keeps none.
         box_turns_samples: Training clouds of boxes with doors, in which these are closed, by which a network learns
             which way round boxes are (`inference.box_turns`); 15 minutes, most of it to register them. 0 learns none.
         orientation_range: How far objects are turned from their mean orientation at most, in degrees; 180 stands for
@@ -106,6 +108,7 @@ class ArticulatedPoseModel(nn.Module):
         pose_samples: int = 1600,
         closed_views_samples: int = 500,
         view_looks_samples: int = 2400,
+        alike_boxes_samples: int = 512,
         box_turns_samples: int = 640,
         orientation_range: float = 180.0,
     ) -> None:
@@ -127,6 +130,7 @@ class ArticulatedPoseModel(nn.Module):
         self.handedness_samples = handedness_samples
         self.part_frames_samples, self.hinge_sides_samples = part_frames_samples, hinge_sides_samples
         self.pose_samples, self.box_turns_samples = pose_samples, box_turns_samples
+        self.alike_boxes_samples = alike_boxes_samples
         self.closed_views_samples, self.view_looks_samples = closed_views_samples, view_looks_samples
         require_at_least(self, **{name: 0 for name in options if name.endswith("_samples")})
 
