@@ -125,7 +125,12 @@ ABLATIONS = (
         _no_network_of_view_turns,
     ),
     Ablation("the network that says poses", lambda of: of.pose_network.learnt, _no_network_of_poses),
-    Ablation("which way round boxes look right", lambda of: of.box_turns.learnt, _no_network_of_box_turns),
+    Ablation("which way round boxes look right", lambda of: of.box_turns.surface is not None, _no_network_of_box_turns),
+    Ablation(
+        "training clouds that boxes are like",
+        lambda of: of.box_turns.alike.learnt,
+        lambda of: of.box_turns.alike.forget(),
+    ),
     Ablation("views of closed doors", lambda of: of.closed_views.learnt, lambda of: of.closed_views.forget()),
     Ablation("free space", lambda of: of.other_views.every_way and bool(of.other_views.reaches), _no_free_space),
     Ablation("fronts of drawers", lambda of: of.front_ends.learnt, lambda of: of.front_ends.forget()),

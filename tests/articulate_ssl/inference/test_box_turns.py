@@ -57,8 +57,8 @@ def test_what_lies_on_its_side_may_look_right_where_some_are_hinged_there(frames
     every = frames.mT[:, None] @ rotation_group(24).elements.float()
     likely = torch.full((CLOUDS, 24), -9.0).index_fill(1, torch.tensor([4]), 1.0).index_fill(1, torch.tensor([9]), 0.0)
     quarter = roma.rotvec_to_rotmat(math.pi / 2 * torch.tensor([[0.0, 0, 0], [0, 0, 1]]))
-    few = torch.tensor([0.0, -2.0])
-    looks = Looks(every, likely, quarter, few)
+    few, alike = torch.tensor([0.0, -2.0]), torch.zeros(CLOUDS, 24)
+    looks = Looks(every, likely, quarter, few, alike)
     assert not looks.decided.any()
     tilt = roma.rotvec_to_rotmat(torch.tensor([0.2, 0.1, -0.1]))  # as registration leaves it
     said = torch.stack([every[:, 4], every[:, 9], every[:, 4] @ quarter[1], every[:, 9] @ quarter[1]], dim=1) @ tilt
@@ -66,9 +66,36 @@ def test_what_lies_on_its_side_may_look_right_where_some_are_hinged_there(frames
     assert most.tolist() == [[0.0, -1.0, -10.0, -10.0]] * CLOUDS and anyhow.tolist() == [[0.0, -1.0] * 2] * CLOUDS
     assert counted.tolist() == [[0.0, -1.0, -2.0, -3.0]] * CLOUDS and stood.tolist() == [[4, 9, 4, 9]] * CLOUDS
     assert (looks.of(every)[1] > -10).sum(dim=1).tolist() == [4] * CLOUDS
-    alone = Looks(every, likely, quarter[:1], few[:1])
+    alone = Looks(every, likely, quarter[:1], few[:1], alike)
     assert torch.equal(torch.stack(alone.of(said)[:3]), most.expand(3, -1, -1))
-    assert Looks(every, likely.index_fill(1, torch.tensor([9]), -1.5), quarter, few).decided.all()
+    assert looks._replace(likely=likely.index_fill(1, torch.tensor([9]), -1.5)).decided.all()
+
+
+def test_how_like_training_clouds_something_is_is_said_of_each_way_apart(frames):
+    every = frames.mT[:, None] @ rotation_group(24).elements.float()
+    alike = torch.full((CLOUDS, 24), -9.0).index_fill(1, torch.tensor([4]), -1.0).index_fill(1, torch.tensor([9]), -4.0)
+    looks = Looks(every, torch.zeros(CLOUDS, 24), torch.eye(3)[None], torch.zeros(1), alike)
+    tilt = roma.rotvec_to_rotmat(torch.tensor([0.2, 0.1, -0.1]))
+    assert looks.like_others(every[:, [4, 9, 11]] @ tilt).tolist() == [[0.0, -3.0, -8.0]] * CLOUDS
+    assert looks.rows(torch.tensor([1])).alike.shape == (1, 24)
+
+
+def test_clouds_that_are_kept_say_how_boxes_are_turned_without_a_network(frames):
+    generator = torch.Generator().manual_seed(0)
+    shape = torch.rand(400, 3, generator=generator) - 0.5
+    shape = shape[(shape.prod(dim=1) > 0) | (shape[:, 0] > 0.2)]  # no symmetry
+    turns = BoxTurns()
+    turns.axes.copy_(roma.random_rotmat(1)[0])
+    turns.alike.learn(shape.expand(3, -1, -1), weight=60.0)
+    assert turns.learnt
+    right = torch.tensor([0, 3, 7, 11, 23])
+    every = frames.mT[:, None] @ rotation_group(24).elements.float()
+    rotation = every[torch.arange(CLOUDS), right]  # in which they stand -> camera
+    looks = turns.looks(shape @ rotation.mT, frames)
+    assert torch.equal(looks.alike.argmax(dim=1), right) and not looks.decided.any()
+    torch.testing.assert_close(looks.likely, torch.full((CLOUDS, 24), -math.log(24)))
+    turns.alike.forget()
+    assert not turns.learnt and not turns.alike.likely(shape[None], every[:1]).any()
 
 
 def test_weights_from_before_it_was_taught_have_none():
@@ -77,5 +104,8 @@ def test_weights_from_before_it_was_taught_have_none():
     taught.axes.copy_(roma.random_rotmat(1)[0])
     other.load_state_dict(taught.state_dict())
     assert other.learnt and torch.equal(other.axes, taught.axes)
+    taught.alike.learn(torch.rand(5, 80, 3), weight=30.0)
+    other.load_state_dict(taught.state_dict())
+    assert all(torch.equal(value, other.alike.state_dict()[name]) for name, value in taught.alike.state_dict().items())
     other.load_state_dict({})
-    assert not other.learnt and torch.equal(other.axes, taught.axes)
+    assert other.surface is None and torch.equal(other.axes, taught.axes)

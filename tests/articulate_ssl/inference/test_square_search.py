@@ -119,15 +119,21 @@ def test_what_training_showed_gives_way_only_to_what_fits_clearly_better(search,
     torch.testing.assert_close(margin, torch.full((4,), 0.1))
 
 
-def _looking_right(search, monkeypatch, data, odds):
-    """The search, told by looks that objects are turned as they are, and with what odds not as `_turned` ones."""
+def _looking_right(search, monkeypatch, data, odds, alike=0.0):
+    """The search, told by looks that objects are turned as they are, and with what odds not as `_turned` ones.
+
+    And with what odds training clouds that are alike say so, too.
+    """
     monkeypatch.setattr(BoxTurns, "learnt", True)
     every = data.base[:, None, :3, :3] @ rotation_group(24).elements.float()
     likely = torch.full((len(every), 24), -20.0)
     likely[:, 0] = 0.0
     turned = (every * (data.base[:, None, :3, :3] @ TURNED)).sum(dim=(-2, -1)).argmax(dim=1)
     likely[torch.arange(len(every)), turned] = -torch.tensor(odds)
-    monkeypatch.setattr(search.turns, "looks", lambda *seen: Looks(every, likely.log_softmax(dim=1), *seen[2:]))
+    like_others = torch.full((len(every), 24), -20.0 * bool(alike)).index_fill(1, torch.tensor([0]), 0.0)
+    like_others[torch.arange(len(every)), turned] = -float(alike)
+    found = likely.log_softmax(dim=1), like_others
+    monkeypatch.setattr(search.turns, "looks", lambda *seen: Looks(every, found[0], *seen[2:], found[1]))
 
 
 def _fitting(search, monkeypatch, data, error):
@@ -198,6 +204,23 @@ def test_what_the_network_alone_says_counts_as_well(search, data, monkeypatch, e
     ]
     assert torch.equal(sought[0], data.base if error < math.exp(1 / 12) else wrong)
     assert torch.equal(sought[1], wrong) and torch.equal(sought[2], wrong)
+
+
+@pytest.mark.parametrize("error", [1.2, 1.4, 2.7])
+@pytest.mark.parametrize("odds", [0.0, -9.0])
+def test_what_is_like_training_clouds_counts_as_well_and_is_tried_if_it_looks_wrong(
+    search, data, monkeypatch, error, odds
+):
+    """By e^(3/12), or 1.28; with looks against it, by e^(-6/12)."""
+    search.measure()
+    wrong, state = _turned(data)
+    _looking_right(search, monkeypatch, data, [odds] * 4, alike=3.0)
+    _fitting(search, monkeypatch, data, error / 2)
+    monkeypatch.setattr(search, "_square", lambda *_: _squares(data.base[:, None], state[:, None]))
+    one, sure = _at(search, wrong, state), torch.full((4,), 0.9)
+    found, _, _ = search.sought(one, one, sure, data.points, data.points)
+    wins = error / 2 < math.exp((3.0 + odds) / 12)
+    assert torch.equal(found.base[:, 0], data.base if wins else wrong)
 
 
 @pytest.mark.parametrize(

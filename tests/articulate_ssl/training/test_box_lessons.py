@@ -1,41 +1,20 @@
 """Doors that predictions know are closed in their clouds, and a network learns which way round boxes then are."""
 
-from dataclasses import replace
-from types import SimpleNamespace
-
 import pytest
 import torch
-from boxes_with_doors import ZERO, lying_boxes
-from tiny import POINTS
+from predicted_boxes import REST, predicted_boxes, predicting_module
 
 from articulate_ssl.discovery.manhattan_frame import manhattan_frames
-from articulate_ssl.inference.box_turns import BoxTurns
-from articulate_ssl.inference.hinge_sides import HingeSides
-from articulate_ssl.inference.part_frames import PartFrames
-from articulate_ssl.inference.state_range import StateRange
 from articulate_ssl.inference.surface_decision import SurfaceDecision
 from articulate_ssl.network.surface_network import SurfaceSize
 from articulate_ssl.training import box_lessons, surface_lessons
 from articulate_ssl.training.box_lessons import doors_closed_further, learn_box_turns
 
 TINY = SurfaceSize(read=64, centers=32, dims=(16, 16), radii=(0.3, 0.5), num_neighbors=8, global_dim=32, head_dim=32)
-REST = torch.tensor([ZERO])
-
-
-def _boxes(count: int, opened: float = 1.2):
-    """Predictions that are right, clouds, and which points are the door's."""
-    found, dense, _ = lying_boxes([0] * count, opened)
-    generator = torch.Generator().manual_seed(0)
-    order = torch.rand(dense.shape[:2], generator=generator).argsort(dim=1)  # each shows other points first
-    dense = dense.gather(1, order[..., None].expand(-1, -1, 3))
-    # The door is the plate that turns: behind the closed door's plane nothing of it is.
-    inside = (dense - found.base_pose[:, None, :3, 3]) @ found.base_pose[:, :3, :3]
-    body = (inside[..., 2] > -0.2501) & (inside[..., 1].abs() < 0.39) & (inside[..., 0].abs() < 0.3001)
-    return replace(found, dense_part_id=(~body).long()), dense, inside
 
 
 def test_doors_turn_about_their_hinges_towards_a_closed_door():
-    found, dense, inside = _boxes(200)
+    found, dense, inside = predicted_boxes(200)
     closed = doors_closed_further(found, dense, REST, torch.Generator().manual_seed(0))
     door = found.dense_part_id == 1
     assert torch.equal(closed[~door], dense[~door]) and door.double().mean() > 0.2
@@ -50,48 +29,17 @@ def test_doors_turn_about_their_hinges_towards_a_closed_door():
     torch.testing.assert_close(across, torch.zeros_like(across), atol=1e-5, rtol=0)
 
 
-class _Search:
-    """Boxes whose doors are closed at `REST`, or something else."""
-
-    def __init__(self, known: bool) -> None:
-        self.known, self.measured = known, False
-
-    def measure(self) -> None:
-        self.measured = True
-
-
-def _module(found, dense, known: bool = True):
-    """Its predictions are right."""
-    part_frames = PartFrames(2)
-    part_frames.axes.copy_(torch.tensor([[0.0, 0, -1], [1, 0, 0], [0, -1, 0]]).expand(2, 3, 3))
-    states, sides = StateRange(1), HingeSides()
-    states.set_rest(ZERO + 0.5)
-    sides.learnt.fill_(True)
-    sides.closed.fill_(0.5)  # from where predictions count
-
-    def predict(points, _count, dense):
-        assert torch.equal(points, dense[:, :POINTS])
-        return found[[int((every - dense[0, 0]).norm(dim=-1).amin(1).argmin()) for dense in dense[:, None]]]
-
-    every = dense
-    estimator = SimpleNamespace(
-        box_turns=BoxTurns(), square_search=_Search(known), states=states, hinge_sides=sides, part_frames=part_frames
-    )
-    estimator.predict = predict
-    return SimpleNamespace(estimator=estimator, num_points=POINTS, inference=SimpleNamespace(points=POINTS))
-
-
 def test_a_network_learns_which_way_round_boxes_with_closed_doors_are(monkeypatch):
     """No box that taught it was closed."""
     for name, value in {"SIZE": TINY, "FEWEST": 40, "TIMES": 60}.items():
         monkeypatch.setattr(surface_lessons, name, value)
     monkeypatch.setattr(box_lessons, "FEWEST", 40)
-    found, dense, _ = _boxes(120)
-    module = _module(found, dense)
+    found, dense, _ = predicted_boxes(120)
+    module = predicting_module(found, dense)
     learn_box_turns(module, dense)
     turns = module.estimator.box_turns
     assert turns.learnt and module.estimator.square_search.measured
-    found, closed, _ = _boxes(40, opened=0.0)
+    found, closed, _ = predicted_boxes(40, opened=0.0)
     frames, _ = manhattan_frames(closed, torch.Generator().manual_seed(0))
     rotation, likely, *_ = turns.looks(closed, frames, torch.eye(3)[None])
     rotation = rotation[torch.arange(len(closed)), likely.argmax(dim=1)]
@@ -101,8 +49,8 @@ def test_a_network_learns_which_way_round_boxes_with_closed_doors_are(monkeypatc
 
 @pytest.mark.parametrize("known, count", [(False, 120), (True, 40)])
 def test_what_is_no_box_or_hardly_seen_teaches_nothing(monkeypatch, known, count):
-    found, dense, _ = _boxes(count)
-    module = _module(found, dense, known)
+    found, dense, _ = predicted_boxes(count)
+    module = predicting_module(found, dense, known)
     module.estimator.box_turns.surface = SurfaceDecision()  # of a run that ended and goes on
     monkeypatch.setattr(module.estimator, "predict", lambda *_, **__: pytest.fail("predicted in vain"))
     learn_box_turns(module, dense)
