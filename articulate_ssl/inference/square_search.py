@@ -223,9 +223,10 @@ class SquareSearch:
         closed = states.rest.to(state).expand_as(state)
         base, right, stood, hinge = (torch.cat([value] * 2, dim=1) for value in (base, right, stood, hinge))
         state = torch.cat([state, closed], dim=1)
-        # What training clouds and the network say is as if all were hinged as most are: what is hinged elsewhere lies.
+        # What the network says is as if all were hinged as most are: what is hinged elsewhere lies. So it does for
+        # training clouds, if its door is open; nearly closed, it is as like those that stand.
         lying = base[..., :3, :3] @ looks.hinges[hinge]
-        alike = looks.like_others(lying)
+        alike = looks.like_others(base[..., :3, :3]).maximum(looks.like_others(lying))
         likely, own = right + looks.log_prior[hinge] + alike, own + looks.like_others(one.base[..., :3, :3])[:, 0]
         if said is not None:
             likely = likely + _as_said(lying, said)
