@@ -5,7 +5,7 @@ or be part of a body that is closed. So a few training clouds are kept as predic
 their doors nearly closed (`training/alike_lesson.py`). All boxes are stretched to one, so that proportions do not
 matter, and of the 24 rotations those are likelier in which the few clouds most alike are nearer.
 
-It is said of objects as if all were hinged as most are: what is hinged at another side looks as if it lay.
+Those that are kept are hinged as most are. What is hinged at another side and open looks as if it lay.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ class Looks(NamedTuple):
         likely: [B, 24] logarithms of probabilities.
         hinges: [W, 3, 3] turns about the door's normal, of hinges that are elsewhere than most; none comes first.
         log_prior: [W] logarithms of the shares of objects that are hinged so.
-        alike: [B, 24] the same as `likely` by the training clouds most alike, of what is hinged as most are.
+        alike: [B, 24] the same as `likely`, by training clouds that are hinged as most are and most alike.
     """
 
     rotation: Tensor
@@ -82,7 +82,7 @@ class Looks(NamedTuple):
 
     def like_others(
         self,
-        turn: Tensor,  # [B, C, 3, 3] base rotations, of what is hinged as most are
+        turn: Tensor,  # [B, C, 3, 3] base rotations
     ) -> Tensor:  # [B, C]
         """How like training clouds what is turned so is, 0 for what is most like them."""
         return (self.alike - self.alike.amax(dim=1, keepdim=True)).gather(1, self._ways(turn))
