@@ -127,7 +127,7 @@ def turned_as_the_alike(
 
     Every cloud stands in its first turn until it is its own turn to choose. A sweep of `synchronise` over clouds that
     are too many for all pairs to be compared in all ways: of 1,000 chests 7.4 % are wrong by the 128 chests of
-    `inference.sliding_search`, 3.9 % by each other (docs/experiments.md, step 352).
+    `inference.sliding_search`, 3.7 % by each other (docs/experiments.md, step 352).
     """
     boxes, _, _ = unit_boxes(clouds @ turns[:, 0].mT)
     relative, standing = turns @ turns[:, :1].mT, boxes[:, :_TURN_POINTS].clone()

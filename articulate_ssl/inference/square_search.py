@@ -12,7 +12,8 @@ that fit best take the cloud's own proportions, without which fits do not tell, 
 Of boxes that are closed even the nearest is often wrong, as a box is one any way round; and of open ones some fit a
 closed box as well, but for the door that hangs out of it. What they look like says more (`box_turns`), if that was
 taught: only what looks right is tried, likeliest first, and how likely that is counts together with how near it is,
-with whether its door stands as training showed, and with what the network alone says. Where explanations stand alike
+with whether its door stands as training showed, and with what the network alone says; and so is how like training
+clouds the whole cloud is (`alike_boxes`), which is tried even if it looks wrong. Where explanations stand alike
 and only differ in where they are hinged, how near they are tells more.
 
 Views show too little of a box for that, and plates say nothing about which of them is which.
