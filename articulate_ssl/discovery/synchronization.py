@@ -129,18 +129,36 @@ def turned_as_the_alike(
     are too many for all pairs to be compared in all ways: of 1,000 chests 7.4 % are wrong by the 128 chests of
     `inference.sliding_search`, 3.7 % by each other (docs/experiments.md, step 352).
     """
-    boxes, _, _ = unit_boxes(clouds @ turns[:, 0].mT)
-    relative, standing = turns @ turns[:, :1].mT, boxes[:, :_TURN_POINTS].clone()
+    standing = unit_boxes(clouds @ turns[:, 0].mT)[0][:, :_TURN_POINTS].clone()
+    others = torch.ones(len(clouds), dtype=torch.bool)
     chosen = torch.zeros(len(clouds), dtype=torch.long)
-    near = min(NEIGHBOURS, len(clouds) - 1)
-    for number, box in enumerate(announced(log, "turns of clouds by those most alike", boxes)):
-        # What is r @ box in another turn lies in the box where the inverse of r puts it.
-        others = torch.einsum("cji,npj->cnpi", relative[number], standing)
-        cost = DistanceFields.of(box[None]).at(0, others).clamp(max=CAP).mean(dim=-1)
-        cost[:, number] = torch.inf
-        chosen[number] = cost.topk(near, largest=False).values.mean(dim=-1).argmin()
-        standing[number] = standing[number] @ relative[number, chosen[number]].mT
+    for number, cloud in enumerate(announced(log, "turns of clouds by those most alike", clouds)):
+        others[number] = False
+        if others.any():
+            cost = distances_to_others(cloud, turns[number].mT, standing[others])
+            chosen[number] = mean_of_nearest(cost).argmin()
+        others[number] = True
+        standing[number] = standing[number] @ (turns[number, chosen[number]] @ turns[number, 0].mT).mT
     return chosen
+
+
+def distances_to_others(
+    cloud: Tensor,  # [P, 3]
+    standing: Tensor,  # [G, 3, 3] frames in which it may stand -> its own, elements of the cube's group apart
+    others: Tensor,  # [n, M, 3] that stand, in boxes of width one
+) -> Tensor:  # [G, n]
+    """Mean distances of others to the cloud, in a box of width one, however it stands."""
+    box, _, _ = unit_boxes((cloud @ standing[0])[None])
+    # What stands at x in one frame is in the first at r @ x.
+    turned = torch.einsum("gij,npj->gnpi", standing[0].mT @ standing, others)
+    return DistanceFields.of(box).at(0, turned).clamp(max=CAP).mean(dim=-1)
+
+
+def mean_of_nearest(
+    distance: Tensor,  # [..., n]
+) -> Tensor:  # [...]
+    """Of the few others that are most alike."""
+    return distance.topk(min(NEIGHBOURS, distance.shape[-1]), dim=-1, largest=False).values.mean(dim=-1)
 
 
 def _descend(costs: Tensor, element: Tensor, group: RotationGroup, generator: torch.Generator) -> Tensor:

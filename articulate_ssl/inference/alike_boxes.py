@@ -13,8 +13,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from articulate_ssl.discovery.distance_field import DistanceFields
-from articulate_ssl.discovery.synchronization import CAP, NEIGHBOURS, unit_boxes
+from articulate_ssl.discovery.synchronization import distances_to_others, mean_of_nearest, unit_boxes
 from articulate_ssl.ops.few_bytes import from_few_bytes, in_few_bytes
 
 GALLERY_POINTS = 64  # of a cloud that is kept; as of chests, whose turns 128 do not tell better (step 352)
@@ -64,7 +63,7 @@ class AlikeBoxes(nn.Module):
         if not self.learnt:
             return dense.new_zeros(standing.shape[:2])
         gallery = from_few_bytes(self.gallery.cpu(), self.step.cpu())
-        distance = [distances(*some, gallery) for some in zip(dense.cpu(), standing.cpu(), strict=True)]
+        distance = [distances_to_others(*some, gallery) for some in zip(dense.cpu(), standing.cpu(), strict=True)]
         return (-self.weight * mean_of_nearest(torch.stack(distance)).log().to(dense)).log_softmax(dim=1)
 
     def _load_from_state_dict(self, state_dict: dict, prefix: str, *rest) -> None:
@@ -73,22 +72,3 @@ class AlikeBoxes(nn.Module):
             value = state_dict.setdefault(prefix + name, own.clone())
             setattr(self, name, torch.empty_like(value, dtype=own.dtype, device=own.device))
         super()._load_from_state_dict(state_dict, prefix, *rest)
-
-
-def distances(
-    cloud: Tensor,  # [P, 3]
-    standing: Tensor,  # [G, 3, 3] frames in which it may stand -> its own
-    gallery: Tensor,  # [n, M, 3] others that stand, in boxes of width one
-) -> Tensor:  # [G, n]
-    """Mean distances of the others to the cloud, in a box of width one, however it stands."""
-    box, _, _ = unit_boxes((cloud @ standing[0])[None])
-    # What stands at x in one frame is in the first at r @ x.
-    others = torch.einsum("gij,npj->gnpi", standing[0].mT @ standing, gallery)
-    return DistanceFields.of(box).at(0, others).clamp(max=CAP).mean(dim=-1)
-
-
-def mean_of_nearest(
-    distance: Tensor,  # [..., n]
-) -> Tensor:  # [...]
-    """Of the few others that are most alike."""
-    return distance.topk(min(NEIGHBOURS, distance.shape[-1]), dim=-1, largest=False).values.mean(dim=-1)

@@ -55,8 +55,7 @@ class Looks(NamedTuple):
 
     def rows(self, rows: Tensor) -> Looks:
         """Those of some of the boxes."""
-        own = {"rotation": self.rotation, "likely": self.likely, "alike": self.alike}
-        return self._replace(**{name: value[rows] for name, value in own.items()})
+        return self._replace(rotation=self.rotation[rows], likely=self.likely[rows], alike=self.alike[rows])
 
     def of(
         self,

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from articulate_ssl.discovery.synchronization import unit_boxes
+from articulate_ssl.discovery.synchronization import distances_to_others, mean_of_nearest, unit_boxes
 from articulate_ssl.geometry.rotation_group import rotation_group
-from articulate_ssl.inference.alike_boxes import GALLERY_POINTS, distances, mean_of_nearest
+from articulate_ssl.inference.alike_boxes import GALLERY_POINTS
 from articulate_ssl.inference.prediction import concatenate
 from articulate_ssl.ops.progress import announced, tell
 from articulate_ssl.training.box_lessons import doors_closed_further
@@ -78,7 +78,7 @@ def _what_they_say(
         # A cloud and its copy are no others.
         others = torch.arange(len(boxes)) % len(clouds) != number
         some = clouds[number] if number % 2 else closed[number]
-        costs.append(mean_of_nearest(distances(some, frame @ every, boxes[others])))
+        costs.append(mean_of_nearest(distances_to_others(some, frame @ every, boxes[others])))
     cost = torch.stack(costs).log()
     likely = [(-weight * cost).log_softmax(dim=1)[:, 0] for weight in _WEIGHTS]
     doubt = math.log(_WRONG / len(every))

@@ -9,7 +9,6 @@ from predicted_boxes import REST, predicted_boxes, predicting_module
 
 from articulate_ssl.discovery.manhattan_frame import manhattan_frames
 from articulate_ssl.inference.hinge_sides import HingeSides
-from articulate_ssl.inference.prediction import concatenate
 from articulate_ssl.training import alike_lesson
 from articulate_ssl.training.alike_lesson import learn_alike_boxes
 
@@ -21,9 +20,9 @@ def _few(monkeypatch):
 
 def _turned_over(found, rows):
     """Predictions of which some are upside down."""
-    base, axis = found.base_pose.clone(), found.joint_axis.clone()
+    base = found.base_pose.clone()
     base[rows, :3, :2] *= -1
-    return replace(found, base_pose=base, joint_axis=axis)
+    return replace(found, base_pose=base)
 
 
 @pytest.mark.parametrize("opened", [1.2, 0.1])
@@ -61,7 +60,6 @@ def test_predictions_that_agree_in_nothing_keep_nothing():
     found, dense, _ = predicted_boxes(48)
     generator = torch.Generator().manual_seed(0)
     order = torch.randperm(48, generator=generator)
-    found = concatenate([found])  # a copy
     base = found.base_pose.clone()
     base[:, :3, :3] = base[order, :3, :3]
     module = predicting_module(replace(found, base_pose=base), dense)
